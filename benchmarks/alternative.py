@@ -1,4 +1,5 @@
-"""The same fit as one writes it without jaxmuscle: `least_squares` with finite differences over a numba Monte Carlo loop.
+"""The same fit as one writes it without jaxmuscle: `least_squares` with finite differences over a
+numba Monte Carlo loop.
 
 Of jaxmuscle it takes the numbers only: default values, the target, and how its bins scatter.
 """
@@ -30,7 +31,9 @@ from jaxmuscle.spectra._bin_law import bin_statistics, standardised
 from jaxmuscle.spectra._settings import WINDOW
 
 SEEDS, RATE, ROUNDS, DOUBT = 48, 100.0, 3, 0.01
-FTOL = 1e-4  # the default 1e-8 creeps along the ripples that fixed seeds leave in the cost, to the last evaluation allowed
+# the default 1e-8 creeps along the ripples that fixed seeds leave in the cost, to the last
+# evaluation allowed
+FTOL = 1e-4
 DEFAULTS = {name: parameter.default for name, parameter in jm.PARAMETERS.items()}
 OURS, OTHER = "jaxmuscle", "scipy and numba"
 
@@ -47,7 +50,8 @@ def _pull(x, v, P_w, coefficients, u):
 
 @numba.njit(parallel=True)
 def _forces(coefficients, P_w, steady, scale, noise, dt, every):
-    """Force of each seed at every `every`-th step, by Heun; `steady` is the harmonic's perturbation, `noise` for scale 1."""
+    """Force of each seed at every `every`-th step, by Heun; `steady` is the harmonic's
+    perturbation, `noise` for scale 1."""
     seeds, points, _ = noise.shape
     forces = np.zeros((seeds, (points - 1) // every + 1))
     for seed in numba.prange(seeds):
@@ -67,7 +71,8 @@ def _forces(coefficients, P_w, steady, scale, noise, dt, every):
 
 @numba.njit(parallel=True)
 def _unit_noise(normals, transition, root):
-    """Band-limited noise (seeds, points, channels) of unit deviation from normals (seeds, points, 2, channels)."""
+    """Band-limited noise (seeds, points, channels) of unit deviation from normals (seeds, points,
+    2, channels)."""
     seeds, points, _, channels = normals.shape
     noise = np.empty((seeds, points, channels))
     for seed in numba.prange(seeds):
@@ -78,7 +83,10 @@ def _unit_noise(normals, transition, root):
                 first, second = normals[seed, i, 0, j], normals[seed, i, 1, j]
                 n, slope = (
                     transition[0, 0] * n + transition[0, 1] * slope + root[0, 0] * first,
-                    transition[1, 0] * n + transition[1, 1] * slope + root[1, 0] * first + root[1, 1] * second,
+                    transition[1, 0] * n
+                    + transition[1, 1] * slope
+                    + root[1, 0] * first
+                    + root[1, 1] * second,
                 )
                 noise[seed, i, j] = n
     return noise
@@ -99,22 +107,45 @@ def simulate(
     p = np.clip((time - 0.5) / 1.0, 0.0, 1.0)
     P_w = v["P_w"] * p**4 * (35 - p * (84 - p * (70 - 20 * p)))
     order = ("m_w", "k_w", "k_z", "c_w", "c_z", "x_ref_w", "x_ref_z", "v_ref_w", "v_ref_z")
-    base = np.array([v[f"k_{j}"] * v[f"x_ref_{j}"] ** 2 for j in "wz"] + [v[f"c_{j}"] * v[f"v_ref_{j}"] ** 2 for j in "wz"])
-    wave = v["harmonic_amplitude"] * np.sin(2 * np.pi * v["harmonic_frequency"] * time + v["harmonic_phase"])
+    base = np.array(
+        [v[f"k_{j}"] * v[f"x_ref_{j}"] ** 2 for j in "wz"]
+        + [v[f"c_{j}"] * v[f"v_ref_{j}"] ** 2 for j in "wz"]
+    )
+    wave = v["harmonic_amplitude"] * np.sin(
+        2 * np.pi * v["harmonic_frequency"] * time + v["harmonic_phase"]
+    )
     scale = base * [v[f"noise_{channel}"] for channel in ("K_w", "K_z", "C_w", "C_z")]
-    return _forces(tuple(v[n] for n in order), P_w, np.outer(wave, base * [1, 1, 0, 0]), scale, noise, DT, EVERY)
+    return _forces(
+        tuple(v[n] for n in order),
+        P_w,
+        np.outer(wave, base * [1, 1, 0, 0]),
+        scale,
+        noise,
+        DT,
+        EVERY,
+    )
 
 
-def low_passed(forces: Float[np.ndarray, "seeds samples"], settings: Any) -> Float[np.ndarray, "seeds times"]:
+def low_passed(
+    forces: Float[np.ndarray, "seeds samples"], settings: Any
+) -> Float[np.ndarray, "seeds times"]:
     """What the low-pass lets through, in the window."""
-    sections = scipy.signal.butter(settings.filter_order, settings.filter_cutoff, fs=settings.rate, output="sos")
-    low_pass = scipy.signal.sosfiltfilt if settings.filter_direction == "both" else scipy.signal.sosfilt
-    return low_pass(sections, forces)[:, round(WINDOW[0] * settings.rate) : round(WINDOW[1] * settings.rate)]
+    sections = scipy.signal.butter(
+        settings.filter_order, settings.filter_cutoff, fs=settings.rate, output="sos"
+    )
+    low_pass = (
+        scipy.signal.sosfiltfilt if settings.filter_direction == "both" else scipy.signal.sosfilt
+    )
+    return low_pass(sections, forces)[
+        :, round(WINDOW[0] * settings.rate) : round(WINDOW[1] * settings.rate)
+    ]
 
 
 def welch(held: Float[np.ndarray, "seeds times"], settings: Any) -> Float[np.ndarray, "seeds bins"]:
     """Power of each seed."""
-    _, power = scipy.signal.welch(held, settings.rate, window=settings.window, nperseg=settings.length)
+    _, power = scipy.signal.welch(
+        held, settings.rate, window=settings.window, nperseg=settings.length
+    )
     return power[:, settings.first_bin : settings.last_bin + 1]
 
 
@@ -127,7 +158,8 @@ class Fitted(NamedTuple):
 
 
 def fit(target: jm.Target, noise: Float[np.ndarray, "seeds points channels"]) -> Fitted:
-    """From the default values, `θ = ln(v / default)` with a prior of deviation 1; the same residuals as `jm.fit`."""
+    """From the default values, `θ = ln(v / default)` with a prior of deviation 1; the same
+    residuals as `jm.fit`."""
     statistics, variation = bin_statistics(target), target_variation(target)
     start, simulations = np.array([DEFAULTS[n] for n in DEFAULT_FREE]), 0
 
@@ -151,21 +183,31 @@ def fit(target: jm.Target, noise: Float[np.ndarray, "seeds points channels"]) ->
 
 
 def check(task: jm.model.AbstractTask, noise: Float[np.ndarray, "seeds points channels"]) -> None:
-    """The loop must equal jaxmuscle's simulation on the same noise, and its spectrum the expected one within its error."""
+    """The loop must equal jaxmuscle's simulation on the same noise, and its spectrum the expected
+    one within its error."""
     forces = simulate({}, noise)
     grid, start = Grid(DT, STEPS, EVERY, reverse=False), round(WINDOW[0] * RATE)
     paths = Realisation(values=jnp.asarray(noise))
     ours = jax.jit(jax.vmap(lambda path: respond(as_arrays(task), path, grid, "instant")[1]))(paths)
     tolerance = EPSILONS * float(jnp.finfo(float).eps)
-    difference = require_equal("numba loop", forces[:, start:, None], ours[:, start:, None], tolerance)
+    difference = require_equal(
+        "numba loop", forces[:, start:, None], ours[:, start:, None], tolerance
+    )
     power = welch(low_passed(forces, task.settings), task.settings)
     error = power.std(axis=0, ddof=1) / np.sqrt(SEEDS)
-    away = float(np.max(np.abs(power.mean(axis=0) - np.asarray(jm.expected_spectrum(task).power)) / error))
+    away = float(
+        np.max(np.abs(power.mean(axis=0) - np.asarray(jm.expected_spectrum(task).power)) / error)
+    )
     bound = float(scipy.stats.t.isf(0.5 * (1 - (1 - DOUBT) ** (1 / power.shape[1])), SEEDS - 1))
-    print(f"numba loop: force equals jaxmuscle's within {difference:.1e} (tolerance {tolerance:.1e}), spectrum the expected "
-          f"one within {away:.1f} standard errors (bound {bound:.1f})")  # fmt: skip
+    print(
+        f"numba loop: force equals jaxmuscle's within {difference:.1e} (tolerance {tolerance:.1e}),"
+        f" spectrum the expected one within {away:.1f} standard errors (bound {bound:.1f})"
+    )
     if not away <= bound:
-        raise Unequal(f"spectrum of the numba loop: {away:.1f} standard errors from the expected one, more than {bound:.1f}")
+        raise Unequal(
+            f"spectrum of the numba loop: {away:.1f} standard errors from the expected one, more"
+            f" than {bound:.1f}"
+        )
 
 
 def _chi2(task: jm.model.AbstractTask, target: jm.Target) -> float:
@@ -177,17 +219,23 @@ def _chi2(task: jm.model.AbstractTask, target: jm.Target) -> float:
 
 
 def rows() -> list[Row]:
-    """Both measured targets with the default noise: all starts and checks of `jm.fit` against one start of the other."""
+    """Both measured targets with the default noise: all starts and checks of `jm.fit` against one
+    start of the other."""
     with jax.enable_x64(True):
         noise = draw_noise()
         return [row for name in TARGETS for row in _compare(name, jm.load_target(name), noise)]
 
 
-def _compare(name: str, target: jm.Target, noise: Float[np.ndarray, "seeds points channels"]) -> list[Row]:
+def _compare(
+    name: str, target: jm.Target, noise: Float[np.ndarray, "seeds points channels"]
+) -> list[Row]:
     task = jm.task_for(target)
     check(task, noise)
     ends: dict[str, Any] = {}
-    programs = {OURS: lambda: ends.update(ours=jm.fit(task, target)), OTHER: lambda: ends.update(other=fit(target, noise))}
+    programs = {
+        OURS: lambda: ends.update(ours=jm.fit(task, target)),
+        OTHER: lambda: ends.update(other=fit(target, noise)),
+    }
     taken = seconds(programs, ROUNDS)
     ours, other = ends["ours"], ends["other"]
     starts, ratio = len(ours.starts), float(np.median(taken[OTHER].wall / taken[OURS].wall))
@@ -201,5 +249,9 @@ def _compare(name: str, target: jm.Target, noise: Float[np.ndarray, "seeds point
         Row(f"{group}: wall time", ratio, "times", f"jm.fit with {starts} starts and checks"),
         Row(f"{group}: wall time", ratio * starts, "times", "jm.fit per start"),
         Row(f"{mine}: chi2 per bin", _chi2(ours.task, target), "1 (expected spectrum)"),
-        Row(f"{group}: chi2 per bin", _chi2(task.replace(**other.values), target), "1 (expected spectrum)"),
+        Row(
+            f"{group}: chi2 per bin",
+            _chi2(task.replace(**other.values), target),
+            "1 (expected spectrum)",
+        ),
     ]

@@ -46,7 +46,8 @@ def _by_numba(rng, p, scale, P_w, F_ext, harmonic_w, harmonic_z, seeds, steps, d
 
 
 def anchors(task: Any) -> dict[str, Any]:
-    """The last x_z of every seed by C, if there is a compiler, and, with white noise, by numba with PCG64."""
+    """The last x_z of every seed by C, if there is a compiler, and, with white noise, by numba with
+    PCG64."""
     inputs = [np.ascontiguousarray(row, np.float32) for row in grid_inputs(task)]
     p, found, compiler = tuple(np.float32(v) for v in numbers(task)), {}, shutil.which("gcc")
     white = isinstance(task.noise, jm.WhiteNoise)
@@ -66,11 +67,18 @@ def anchors(task: Any) -> dict[str, Any]:
         folder = Path(tempfile.mkdtemp())
         source = Path(__file__).with_name("anchor.c")
         flags = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC"]
-        subprocess.run([compiler, *flags, str(source), "-o", str(folder / "anchor.so"), "-lm"], check=True)
+        subprocess.run(
+            [compiler, *flags, str(source), "-o", str(folder / "anchor.so"), "-lm"], check=True
+        )
         library = ctypes.CDLL(str(folder / "anchor.so"))
         given = [] if white else [np.ascontiguousarray(matrix, np.float32) for matrix in (f, root)]
         program = library.simulate if white else library.filtered
-        program.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_float, *[ctypes.c_void_p] * (7 + len(given))]
+        program.argtypes = [
+            ctypes.c_int,
+            ctypes.c_int,
+            ctypes.c_float,
+            *[ctypes.c_void_p] * (7 + len(given)),
+        ]
 
         def by_c():
             out = np.empty(SEEDS, np.float32)

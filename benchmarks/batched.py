@@ -1,4 +1,5 @@
-"""Task 2 written by hand as batched scans, the fastest that we know: one array per state, coefficients written out."""
+"""Task 2 written by hand as batched scans, the fastest that we know: one array per state,
+coefficients written out."""
 
 from typing import Any
 
@@ -15,19 +16,35 @@ BAND = (float(jm.BandLimitedNoise().rate), float(jm.BandLimitedNoise().cutoff))
 def numbers(task: Any) -> tuple[Any, ...]:
     """Masses, factors and squared references of the paper's muscle."""
     m = task.muscle
-    return (m.m_w, m.m_z, m.stiffness_w.k, m.stiffness_z.k, m.damping_w.c, m.damping_z.c, m.stiffness_w.x_ref**2,
-            m.stiffness_z.x_ref**2, m.damping_w.v_ref**2, m.damping_z.v_ref**2)  # fmt: skip
+    return (
+        m.m_w,
+        m.m_z,
+        m.stiffness_w.k,
+        m.stiffness_z.k,
+        m.damping_w.c,
+        m.damping_z.c,
+        m.stiffness_w.x_ref**2,
+        m.stiffness_z.x_ref**2,
+        m.damping_w.v_ref**2,
+        m.damping_z.v_ref**2,
+    )
 
 
 def _slope(p: tuple, inputs: tuple, y: tuple, noise: tuple) -> tuple:
-    """Increment of (x_w, v_w, x_z, v_z), one array per state; `inputs` and `noise` (of K_w, K_z, C_w, C_z) times dt."""
+    """Increment of (x_w, v_w, x_z, v_z), one array per state; `inputs` and `noise` (of K_w, K_z,
+    C_w, C_z) times dt."""
     m_w, m_z, k_w, k_z, c_w, c_z, xw2, xz2, vw2, vz2 = p
     (x_w, v_w, x_z, v_z), (dt, P_w, F_ext, harmonic_w, harmonic_z) = y, inputs
     K_w = dt * k_w * (xw2 + x_w**2) + harmonic_w + noise[0]
     K_z = dt * k_z * (xz2 + x_z**2) + harmonic_z + noise[1]
     C_w, C_z = dt * c_w * (vw2 + v_w**2) + noise[2], dt * c_z * (vz2 + v_z**2) + noise[3]
     passive = C_z * (v_z - v_w) + K_z * (x_z - x_w)
-    return dt * v_w, (P_w - C_w * v_w - K_w * x_w + passive) / m_w, dt * v_z, -(F_ext + passive) / m_z
+    return (
+        dt * v_w,
+        (P_w - C_w * v_w - K_w * x_w + passive) / m_w,
+        dt * v_z,
+        -(F_ext + passive) / m_z,
+    )
 
 
 def grid_inputs(task: Any) -> list[Any]:
@@ -60,7 +77,8 @@ def _kept(step: Any, carry: Any, xs: Any) -> Any:
 
 
 def _drawn(key: Any, rows: int, count: int) -> Any:
-    """Normals of JAX, (rows, count, seeds), from a key for every seed; eight seeds at a time, which stay in the cache."""
+    """Normals of JAX, (rows, count, seeds), from a key for every seed; eight seeds at a time, which
+    stay in the cache."""
     one = lambda i: jax.random.normal(jax.random.fold_in(key, i), (rows, count))  # noqa: E731
     return jnp.moveaxis(jax.lax.map(one, jnp.arange(SEEDS), batch_size=8), 0, -1)
 
@@ -91,10 +109,13 @@ def band_by_hand(task: Any, key: Any) -> Any:
         (y, n, slope), (inputs, kick) = carry, x
         new = tuple(f[0, 0] * n[i] + f[0, 1] * slope[i] + root[0, 0] * kick[i] for i in range(4))
         steep = tuple(
-            f[1, 0] * n[i] + f[1, 1] * slope[i] + root[1, 0] * kick[i] + root[1, 1] * kick[4 + i] for i in range(4)
+            f[1, 0] * n[i] + f[1, 1] * slope[i] + root[1, 0] * kick[i] + root[1, 1] * kick[4 + i]
+            for i in range(4)
         )
         before, after = (tuple(scale[i] * values[i] for i in range(4)) for values in (n, new))
         return _heun(p, inputs, y, before, after), new, steep
 
     rows = tuple(normals[0, i] for i in range(8))
-    return _kept(step, (start, rows[:4], rows[4:]), (_inputs(task), normals[1:].reshape(-1, EVERY, 8, SEEDS)))
+    return _kept(
+        step, (start, rows[:4], rows[4:]), (_inputs(task), normals[1:].reshape(-1, EVERY, 8, SEEDS))
+    )

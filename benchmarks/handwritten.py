@@ -14,12 +14,18 @@ from jaxtyping import Array, Float
 from jaxmuscle.model import AbstractNoise, AbstractTask
 
 
-def drawn(noise: AbstractNoise, key: Any, seeds: int, steps: int) -> Float[Array, "seeds steps channels"]:
+def drawn(
+    noise: AbstractNoise, key: Any, seeds: int, steps: int
+) -> Float[Array, "seeds steps channels"]:
     """Normals of every seed as jaxmuscle draws them; few at a time, which stay in the cache."""
-    return jax.lax.map(lambda i: noise.draw(jax.random.fold_in(key, i), steps), jnp.arange(seeds), batch_size=8)
+    return jax.lax.map(
+        lambda i: noise.draw(jax.random.fold_in(key, i), steps), jnp.arange(seeds), batch_size=8
+    )
 
 
-def _heun(slope: Callable[[Any, Any, Any], Any], t: Any, dt: float, y: Any, u: tuple[Any, Any]) -> Any:
+def _heun(
+    slope: Callable[[Any, Any, Any], Any], t: Any, dt: float, y: Any, u: tuple[Any, Any]
+) -> Any:
     before = slope(t, y, u[0])
     return y + 0.5 * (before + slope(t + dt, y + before, u[1]))
 
@@ -42,7 +48,9 @@ def _column(row: Any, like: Any) -> Any:
     return row.reshape(4, *(1,) * (like.ndim - 1))
 
 
-def white_scan(task: AbstractTask, increments: Float[Array, "steps 4 *seeds"], dt: float, every: int) -> Any:
+def white_scan(
+    task: AbstractTask, increments: Float[Array, "steps 4 *seeds"], dt: float, every: int
+) -> Any:
     """Stratonovich Heun for white noise: one `jvp` gives drift and diffusion times increment."""
     start = jnp.zeros((4, *increments.shape[2:]), increments.dtype)
     base, scale = _column(task.harmonic_base()[:4], start), _column(task.noise_scale(), start)
@@ -62,7 +70,8 @@ def white_scan(task: AbstractTask, increments: Float[Array, "steps 4 *seeds"], d
 
 
 def filter_matrices(rate: float, cutoff: float, dt: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Exact transition of `(N, N'/ω)` in units of its stationary deviation, the root of its noise, that deviation."""
+    """Exact transition of `(N, N'/ω)` in units of its stationary deviation, the root of its noise,
+    that deviation."""
     omega = 2 * np.pi * cutoff
     transition = scipy.linalg.expm(omega * dt * np.array([[0.0, 1.0], [-1.0, -np.sqrt(2)]]))
     root = np.linalg.cholesky(np.eye(2) - transition @ transition.T)
@@ -80,7 +89,10 @@ def band_scan(
     (f, root, deviation), dtype = matrices, normals.dtype
     f, root = np.asarray(f, dtype), np.asarray(root, dtype)
     start = jnp.zeros((4, *normals.shape[2:]), dtype)
-    base, scale = _column(task.harmonic_base()[:4], start), _column(task.noise_scale(), start) * deviation
+    base, scale = (
+        _column(task.harmonic_base()[:4], start),
+        _column(task.noise_scale(), start) * deviation,
+    )
 
     def slope_of(t, y, u):
         return dt * task.vector_field(t, y, u)
@@ -95,8 +107,16 @@ def band_scan(
     return _scan(step, (start, normals[0, :4], normals[0, 4:]), normals[1:], dt, every)
 
 
-def stock_diffrax(task: AbstractTask, path: dfx.AbstractBrownianPath, rate: float, dt: float, steps: int, every: int) -> Any:
-    """White noise in plain diffrax: time in seconds, `Heun`, a path of diffrax's own, every `every`-th step saved."""
+def stock_diffrax(
+    task: AbstractTask,
+    path: dfx.AbstractBrownianPath,
+    rate: float,
+    dt: float,
+    steps: int,
+    every: int,
+) -> Any:
+    """White noise in plain diffrax: time in seconds, `Heun`, a path of diffrax's own, every
+    `every`-th step saved."""
     scale, base = task.noise_scale() / np.sqrt(rate), task.harmonic_base()[:4]
 
     def drift(t, y, _):

@@ -1,10 +1,12 @@
-"""What becomes of damaged recordings: mutants of small good files in every format, each read as `load_recording` reads it.
+"""What becomes of damaged recordings: mutants of small good files in every format, each read as
+`load_recording` reads it.
 
     python benchmarks/hostile.py [--count 5000] [--only mat npz ...]
 
-Each mutant is to be read, or refused in one sentence that names it. For each format: how many were read, refused by the
-library, refused because they ended the process that reads (a crash), because they held too much, because they took too
-long; and how many did anything else, which makes the exit code 1. About ten minutes.
+Each mutant is to be read, or refused in one sentence that names it. For each format: how many were
+read, refused by the library, refused because they ended the process that reads (a crash), because
+they held too much, because they took too long; and how many did anything else, which makes the exit
+code 1. About ten minutes.
 """
 
 import argparse
@@ -21,8 +23,12 @@ from hostile_files import TEXTS, WRITERS, answers, mutant, outcome, text_outcome
 
 MOST = 64 << 20  # bytes that a file may hold
 BATCH = 250
-KINDS = (("crashed", "its reader crashed"), ("too large", "it holds more than"), ("too long", "did not come to an end"),
-         ("no answer", "ended without an answer"))  # fmt: skip
+KINDS = (
+    ("crashed", "its reader crashed"),
+    ("too large", "it holds more than"),
+    ("too long", "did not come to an end"),
+    ("no answer", "ended without an answer"),
+)
 
 
 def fate(path: Path, said: str) -> str:
@@ -65,7 +71,9 @@ def textual(name: str, count: int, folder: Path) -> collections.Counter:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=5000, help="mutants of every format")
     parser.add_argument("--only", nargs="*", default=[*WRITERS, *TEXTS], help="formats")
     given = parser.parse_args()

@@ -1,4 +1,5 @@
-"""Rows 1 to 3: the ensemble engine against hand-written scans and against diffrax's own Brownian paths."""
+"""Rows 1 to 3: the ensemble engine against hand-written scans and against diffrax's own Brownian
+paths."""
 
 from functools import partial
 from typing import Any
@@ -25,11 +26,15 @@ OURS, SCAN, LAST = "jaxmuscle", "vmapped lax.scan", "lax.scan, seed axis last"
 def _agreement(group: str, states: dict[str, Any]) -> None:
     tolerance = EPSILONS * float(jnp.finfo(states[OURS].dtype).eps)
     for name in (SCAN, LAST):
-        difference = require_equal(f"{group}, {OURS} against {name}", states[OURS], states[name], tolerance)
+        difference = require_equal(
+            f"{group}, {OURS} against {name}", states[OURS], states[name], tolerance
+        )
         print(f"{group}: {OURS} equals {name} within {difference:.1e} (tolerance {tolerance:.1e})")
 
 
-def _compare(group: str, programs: dict[str, Program], repetitions: int, target: float) -> list[Row]:
+def _compare(
+    group: str, programs: dict[str, Program], repetitions: int, target: float
+) -> list[Row]:
     steps = dict.fromkeys(programs, SEEDS * STEPS)
     taken = seconds(programs, repetitions)
     ratios = speed_ratio(group, taken, steps, (OURS, SCAN), target)
@@ -37,17 +42,24 @@ def _compare(group: str, programs: dict[str, Program], repetitions: int, target:
     return speeds(group, taken, steps) + ratios
 
 
-def _against_scan(label: str, noise: Any, given: Any, scans: dict[str, Any], repetitions: int, target: float) -> list:
-    """Integration on given noise, then whole calls; `given` prepares the noise, `scans` integrate it."""
+def _against_scan(
+    label: str, noise: Any, given: Any, scans: dict[str, Any], repetitions: int, target: float
+) -> list:
+    """Integration on given noise, then whole calls; `given` prepares the noise, `scans` integrate
+    it."""
     task, key = as_arrays(jm.PrescribedForce(noise=noise)), jax.random.key(0)
     normals = jax.block_until_ready(given(key))
 
     @eqx.filter_jit
     def engine(task, normals):
-        return jax.vmap(lambda z: respond(task, task.noise.realise(z, DT), GRID, "instant")[0])(normals)
+        return jax.vmap(lambda z: respond(task, task.noise.realise(z, DT), GRID, "instant")[0])(
+            normals
+        )
 
     integrate = {name: eqx.filter_jit(scan) for name, scan in scans.items()}
-    programs = {OURS: lambda: engine(task, normals)} | {n: partial(s, task, normals) for n, s in integrate.items()}
+    programs = {OURS: lambda: engine(task, normals)} | {
+        n: partial(s, task, normals) for n, s in integrate.items()
+    }
     _agreement(label, {name: program() for name, program in programs.items()})
 
     @eqx.filter_jit
@@ -56,7 +68,9 @@ def _against_scan(label: str, noise: Any, given: Any, scans: dict[str, Any], rep
         return states, states[..., 2]
 
     calls = {
-        OURS: lambda: (lambda r: (r.states, r.output))(jm.ensemble(task, key, seeds=SEEDS, control=False)),
+        OURS: lambda: (lambda r: (r.states, r.output))(
+            jm.ensemble(task, key, seeds=SEEDS, control=False)
+        ),
         SCAN: lambda: whole(task, key),
     }
     tolerance = EPSILONS * float(jnp.finfo(normals.dtype).eps)
@@ -77,7 +91,9 @@ def white(dtype: str, repetitions: int) -> list[Row]:
         return jnp.moveaxis(white_scan(task, size * jnp.moveaxis(normals, 0, -1), DT, EVERY), -1, 0)
 
     given = eqx.filter_jit(lambda key: drawn(noise, key, SEEDS, STEPS))
-    return _against_scan(f"white, {dtype}", noise, given, {SCAN: vmapped, LAST: seeds_last}, repetitions, 0.75)
+    return _against_scan(
+        f"white, {dtype}", noise, given, {SCAN: vmapped, LAST: seeds_last}, repetitions, 0.75
+    )
 
 
 def band_limited(dtype: str, repetitions: int) -> list[Row]:
@@ -89,20 +105,28 @@ def band_limited(dtype: str, repetitions: int) -> list[Row]:
         return jax.vmap(lambda z: band_scan(task, z, matrices, DT, EVERY))(normals)
 
     def seeds_last(task, normals):
-        return jnp.moveaxis(band_scan(task, jnp.moveaxis(normals, 0, -1), matrices, DT, EVERY), -1, 0)
+        return jnp.moveaxis(
+            band_scan(task, jnp.moveaxis(normals, 0, -1), matrices, DT, EVERY), -1, 0
+        )
 
     given = eqx.filter_jit(lambda key: drawn(noise, key, SEEDS, STEPS))
-    return _against_scan(f"band-limited, {dtype}", noise, given, {SCAN: vmapped, LAST: seeds_last}, repetitions, 0.5)
+    return _against_scan(
+        f"band-limited, {dtype}", noise, given, {SCAN: vmapped, LAST: seeds_last}, repetitions, 0.5
+    )
 
 
 def stock(dtype: str, repetitions: int) -> list[Row]:
-    """Row 3: whole calls, since these paths draw as they go. The tree spans 15 s, of which 1 s is integrated."""
+    """Row 3: whole calls, since these paths draw as they go. The tree spans 15 s, of which 1 s is
+    integrated."""
     group, short = f"stock, {dtype}, whole call", 1000
     noise = jm.WhiteNoise()
     task, key = as_arrays(jm.PrescribedForce(noise=noise)), jax.random.key(0)
     paths = {
         "UnsafeBrownianPath": (lambda k: dfx.UnsafeBrownianPath((4,), k), STEPS),
-        "VirtualBrownianTree": (lambda k: dfx.VirtualBrownianTree(0.0, STEPS * DT, DT / 2, (4,), k), short),
+        "VirtualBrownianTree": (
+            lambda k: dfx.VirtualBrownianTree(0.0, STEPS * DT, DT / 2, (4,), k),
+            short,
+        ),
     }
 
     @eqx.filter_jit
@@ -123,10 +147,13 @@ def stock(dtype: str, repetitions: int) -> list[Row]:
 
 
 def _same_spread(what: str, ours: Any, other: Any, sample: int) -> None:
-    """Other noise, same law: standard deviations over the seeds agree to half, four times their standard error."""
+    """Other noise, same law: standard deviations over the seeds agree to half, four times their
+    standard error."""
     spreads = [np.std(np.asarray(states)[:, sample, 2]) for states in (ours, other)]
     if not abs(np.log(spreads[0] / spreads[1])) < 0.5:
-        raise Unequal(f"{what}: standard deviations {spreads[0]:.3g} and {spreads[1]:.3g} of x_z differ")
+        raise Unequal(
+            f"{what}: standard deviations {spreads[0]:.3g} and {spreads[1]:.3g} of x_z differ"
+        )
 
 
 def rows(which: str, repetitions: int) -> list[Row]:

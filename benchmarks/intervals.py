@@ -1,10 +1,12 @@
-"""How often 95 % intervals hold the truth, in recordings made by NumPy from a known spectrum, without the model.
+"""How often 95 % intervals hold the truth, in recordings made by NumPy from a known spectrum,
+without the model.
 
     python benchmarks/intervals.py steadiness [--count N]
 
-`steadiness` looks at the intervals of `jm.steadiness`. The spectrum relaxes from a corner of 0.5, 1 or 2 Hz on, and has a
-floor; half of the recordings have a tremor at 9 Hz. Others have a level that wanders: 1/f^1.5, with periods up to eight
-recordings long. Takes ten minutes; the outcome stands in docs/recordings.md.
+`steadiness` looks at the intervals of `jm.steadiness`. The spectrum relaxes from a corner of 0.5, 1
+or 2 Hz on, and has a floor; half of the recordings have a tremor at 9 Hz. Others have a level that
+wanders: 1/f^1.5, with periods up to eight recordings long. Takes ten minutes; the outcome stands in
+docs/recordings.md.
 """
 
 import functools
@@ -44,31 +46,52 @@ def density(f: np.ndarray, corner: float, tremor: bool) -> np.ndarray:
 
 
 def forces(count: int, seconds: float, corner: float, tremor: bool, seed: int) -> np.ndarray:
-    """Stationary Gaussian recordings, whose level also differs as that of a part of a longer one does."""
-    n, rng = round(PERIODS * seconds * RATE), np.random.default_rng([seed, round(seconds), round(10 * corner), tremor])
+    """Stationary Gaussian recordings, whose level also differs as that of a part of a longer one
+    does."""
+    n, rng = (
+        round(PERIODS * seconds * RATE),
+        np.random.default_rng([seed, round(seconds), round(10 * corner), tremor]),
+    )
     f = np.fft.rfftfreq(n, 1 / RATE)
     power = density(f, corner, tremor)
     power *= DEVIATION**2 / power.sum()
     z = rng.standard_normal((count, f.size)) + 1j * rng.standard_normal((count, f.size))
     z[:, 0] *= np.sqrt(2)  # half of a bin, and real: E x² of it is power / 2
-    return MEAN + (np.fft.irfft(z * np.sqrt(power / 2), n) * n / np.sqrt(2))[:, : round(seconds * RATE)]
+    return (
+        MEAN
+        + (np.fft.irfft(z * np.sqrt(power / 2), n) * n / np.sqrt(2))[:, : round(seconds * RATE)]
+    )
 
 
 def steadiness(count: int) -> None:
     """How often the interval, and value ± 1.96 errors, hold the truth; both lengths together.
 
-    The truth is the mean over all recordings; of the force, what was put in; of the peak, the hill of the mean spectrum.
+    The truth is the mean over all recordings; of the force, what was put in; of the peak, the hill
+    of the mean spectrum.
     """
     for level, kinds in LEVELS.items():
         held: Counts = defaultdict(lambda: defaultdict(list))
         # A recording is in five groups: what takes long is computed once.
-        with mock.patch.multiple(_steadiness, regularity=kept(_steadiness.regularity), dfa=kept(_steadiness.dfa)):
+        with mock.patch.multiple(
+            _steadiness, regularity=kept(_steadiness.regularity), dfa=kept(_steadiness.dfa)
+        ):
             for seconds, (corner, tremor) in itertools.product(LENGTHS, kinds):
                 count_held(forces(count, seconds, corner, tremor, 1), tremor, held)
-        print(f"{level} level, held by the interval (by ± 1.96 errors) of so many trials: {', '.join(map(str, TRIALS))}")
+        print(
+            f"{level} level, held by the interval (by ± 1.96 errors) of so many trials:"
+            f" {', '.join(map(str, TRIALS))}"
+        )
         for name, by_trials in held.items():
-            shares = [(100 * np.mean(by_trials[n], axis=0), len(by_trials[n])) for n in TRIALS if by_trials[n]]
-            print(f"  {name}: " + ", ".join(f"{law:.1f} ({plain:.1f}) % of {n}" for (law, plain), n in shares), flush=True)
+            shares = [
+                (100 * np.mean(by_trials[n], axis=0), len(by_trials[n]))
+                for n in TRIALS
+                if by_trials[n]
+            ]
+            print(
+                f"  {name}: "
+                + ", ".join(f"{law:.1f} ({plain:.1f}) % of {n}" for (law, plain), n in shares),
+                flush=True,
+            )
 
 
 def kept(measure: Callable[[np.ndarray], Any]) -> Callable[[np.ndarray], Any]:
@@ -78,11 +101,16 @@ def kept(measure: Callable[[np.ndarray], Any]) -> Callable[[np.ndarray], Any]:
 
 
 def count_held(signals: np.ndarray, tremor: bool, held: Counts) -> None:
-    """Adds whether the interval, and value ± 1.96 errors, of every measure of every group of trials hold the truth."""
+    """Adds whether the interval, and value ± 1.96 errors, of every measure of every group of trials
+    hold the truth."""
     recordings = [jm.Recording(x, RATE) for x in signals]
     each = [jm.steadiness(recording) for recording in recordings]
-    truth = {name: np.mean([one[name].value for one in each]) for name in each[0].measures} | {"mean": MEAN}
-    spectra = np.concatenate([_steadiness._segments(recording.filtered()) for recording in recordings])
+    truth = {name: np.mean([one[name].value for one in each]) for name in each[0].measures} | {
+        "mean": MEAN
+    }
+    spectra = np.concatenate(
+        [_steadiness._segments(recording.filtered()) for recording in recordings]
+    )
     truth["peak_frequency"] = _steadiness._hill(spectra.mean(axis=0), 0.0) if tremor else math.nan
     for trials in TRIALS:
         for i in range(0, len(recordings) - trials + 1, trials):
@@ -90,7 +118,10 @@ def count_held(signals: np.ndarray, tremor: bool, held: Counts) -> None:
             for name, m in found.measures.items():
                 if m.stderr is not None and m.interval is not None and np.isfinite(truth[name]):
                     low, high = m.interval
-                    inside = low <= truth[name] <= high, abs(m.value - truth[name]) <= NORMAL * m.stderr
+                    inside = (
+                        low <= truth[name] <= high,
+                        abs(m.value - truth[name]) <= NORMAL * m.stderr,
+                    )
                     held[name][trials].append((bool(inside[0]), bool(inside[1])))
 
 

@@ -2,11 +2,12 @@
 
     python benchmarks/kills.py [--trials 20] [--only parts runs writers]
 
-`parts`: four parts start at once, one of them ends by SIGKILL at a random moment (also while it starts) and is run again,
-all are merged. `runs`: one process ends by SIGKILL at a random moment, twice, and is resumed. `writers`: two processes start
-on one reduced store, the second a random moment later, with the same settings, or to overwrite it with others; whoever is
-refused must say so. Paths must be those of one run bit by bit, moments of parts to 1e-6 of the largest value, all others
-bit by bit. A quarter of an hour.
+`parts`: four parts start at once, one of them ends by SIGKILL at a random moment (also while it
+starts) and is run again, all are merged. `runs`: one process ends by SIGKILL at a random moment,
+twice, and is resumed. `writers`: two processes start on one reduced store, the second a random
+moment later, with the same settings, or to overwrite it with others; whoever is refused must say
+so. Paths must be those of one run bit by bit, moments of parts to 1e-6 of the largest value, all
+others bit by bit. A quarter of an hour.
 """
 
 import argparse
@@ -26,7 +27,8 @@ import jaxmuscle as jm
 from jaxmuscle.ensembles import _run
 
 PARTS, REFUSED = 4, 3
-PRELOADED = ["diffrax", "zarr", "xarray", "jaxmuscle.ensembles._run"]  # so a process is a fork, without a device
+# so a process is a fork, without a device
+PRELOADED = ["diffrax", "zarr", "xarray", "jaxmuscle.ensembles._run"]
 OPTIONS: dict[str, Any] = {"seeds": 4000, "duration": 1.0, "chunk": 64}
 ROUNDING = 1e-6  # of the largest value: tallies of parts are added in another order
 
@@ -38,13 +40,21 @@ def run(store: str, reduce: bool, key: int, given: dict[str, Any]) -> None:
         jm.ensemble(jm.Isometric(), jax.random.key(key), store=store, reduce=reduce, **given)
     except jm.errors.StoreError as error:
         told = str(error)
-        sys.exit(REFUSED if " is writing it" in told or "exists already" in told or "other settings" in told else told)
+        sys.exit(
+            REFUSED
+            if " is writing it" in told or "exists already" in told or "other settings" in told
+            else told
+        )
 
 
 def whole(reduce: bool, key: int = 5) -> Any:
     """One run of all, in memory."""
     return jm.ensemble(
-        jm.Isometric(), jax.random.key(key), reduce=reduce, **OPTIONS, **({} if reduce else {"control": False})
+        jm.Isometric(),
+        jax.random.key(key),
+        reduce=reduce,
+        **OPTIONS,
+        **({} if reduce else {"control": False}),
     )
 
 
@@ -86,7 +96,8 @@ def parts(store: Path, reduce: bool, rng: random.Random, longest: float) -> tupl
     victim, *others = [begun(store, reduce, part=(number, PARTS)) for number in numbers]
     early = killed(victim, rng, longest)
     ended(others)
-    ended([begun(store, reduce, part=(number, PARTS)) for number in numbers[:2]])  # the second had ended: it only looks
+    # the second had ended: it only looks
+    ended([begun(store, reduce, part=(number, PARTS)) for number in numbers[:2]])
     return jm.ensembles.merge(store), early
 
 
@@ -117,7 +128,11 @@ def equal(found: Any, one: Any, reduce: bool, tolerance: float = ROUNDING) -> bo
     """Whether a store is one run."""
     if not reduce:
         return np.array_equal(found["F_ext"], one.output)
-    pairs = (found["mean"], one.mean), (found["variance"], one.variance), (found["quantiles"], one.quantile)
+    pairs = (
+        (found["mean"], one.mean),
+        (found["variance"], one.variance),
+        (found["quantiles"], one.quantile),
+    )
     return all(np.abs(np.asarray(a) - b).max() <= tolerance * np.abs(b).max() for a, b in pairs)
 
 
@@ -128,14 +143,20 @@ def killing(name: str, trial: Callable, trials: int, tolerance: float) -> bool:
         one, rng = whole(reduce), random.Random(int(reduce))
         same, early = [], 0
         with tempfile.TemporaryDirectory() as folder:
-            longest = [undisturbed(Path(folder) / f"first-{turn}.zarr", reduce) for turn in range(2)][-1]  # once compiled
+            # once compiled
+            longest = [
+                undisturbed(Path(folder) / f"first-{turn}.zarr", reduce) for turn in range(2)
+            ][-1]
             for number in range(trials):
                 found, was_killed = trial(Path(folder) / f"{number}.zarr", reduce, rng, longest)
                 early += was_killed
                 same.append(equal(found, one, reduce, tolerance))
         good += sum(same)
         kind = "reduced" if reduce else "trajectories"
-        print(f"{name}, {kind}: {sum(same)} of {trials} equal one run; {early} killed on their way", flush=True)
+        print(
+            f"{name}, {kind}: {sum(same)} of {trials} equal one run; {early} killed on their way",
+            flush=True,
+        )
     return good == 2 * trials
 
 
@@ -148,7 +169,10 @@ def writing(trials: int) -> bool:
             found, key, was_refused = writers(Path(folder) / f"{number}.zarr", rng, longest)
             refused += was_refused
             same.append(equal(found, ones[key], True, 0.0))
-    print(f"writers: {sum(same)} of {trials} equal one run; one of the two was refused in {refused}", flush=True)
+    print(
+        f"writers: {sum(same)} of {trials} equal one run; one of the two was refused in {refused}",
+        flush=True,
+    )
     return all(same)
 
 
@@ -167,6 +191,11 @@ def main(trials: int, only: list[str]) -> bool:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--trials", type=int, default=20)
-    parser.add_argument("--only", nargs="+", choices=["parts", "runs", "writers"], default=["parts", "runs", "writers"])
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=["parts", "runs", "writers"],
+        default=["parts", "runs", "writers"],
+    )
     given = parser.parse_args()
     sys.exit(0 if main(given.trials, given.only) else 1)

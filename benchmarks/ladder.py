@@ -1,4 +1,5 @@
-"""How often the ladder of a fit chooses the right model, and whether what it then states is right, on simulated recordings.
+"""How often the ladder of a fit chooses the right model, and whether what it then states is right,
+on simulated recordings.
 
     python benchmarks/ladder.py selection|line|recovery [--count N]
 
@@ -16,15 +17,24 @@ from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._consequences import expand, quantities
 
 TASK = jm.Isometric()
-QUIET = TASK.replace(noise_K_z=0.002)  # with the default's floor a tremor of 3 % is a quarter of the power at 9 Hz
+# with the default's floor a tremor of 3 % is a quarter of the power at 9 Hz
+QUIET = TASK.replace(noise_K_z=0.002)
 TWITCH = 0.08
 SHARES = {"resonance": 0.03, "resonance_2": 0.08}
-DESIGNS = {"10 s": (1, 6), "60 s": (1, 45), "ten trials of 15 s": (10, 10)}  # trials, segments of each
-QUANTITIES = ("tremor_frequency", "tremor_width", "tremor_share", "contraction_time", "half_power_frequency")
+# trials, segments of each
+DESIGNS = {"10 s": (1, 6), "60 s": (1, 45), "ten trials of 15 s": (10, 10)}
+QUANTITIES = (
+    "tremor_frequency",
+    "tremor_width",
+    "tremor_share",
+    "contraction_time",
+    "half_power_frequency",
+)
 
 
 def with_shares(task: jm.Isometric, shares: dict[str, float]) -> jm.Isometric:
-    """The task whose rhythms have these shares of the expected power of the bins; linear response is quadratic in them."""
+    """The task whose rhythms have these shares of the expected power of the bins; linear response
+    is quadratic in them."""
     names = {f"{name}_amplitude": share for name, share in shares.items()}
 
     def power(amplitudes: dict[str, float]) -> float:
@@ -34,7 +44,9 @@ def with_shares(task: jm.Isometric, shares: dict[str, float]) -> jm.Isometric:
     rest = power(without)
     own = {name: (power(without | {name: 0.005}) - rest) / 0.005**2 for name in names}
     whole = rest / (1 - sum(shares.values()))
-    return task.replace(**{name: float(np.sqrt(share * whole / own[name])) for name, share in names.items()})
+    return task.replace(
+        **{name: float(np.sqrt(share * whole / own[name])) for name, share in names.items()}
+    )
 
 
 def truth(rung: int) -> jm.Isometric:
@@ -55,7 +67,11 @@ def simulated(task: jm.Isometric, design: str, count: int, key: int) -> list[jm.
 def described(task: jm.Isometric) -> str:
     """What the truth has at which size."""
     known = consequences(task)
-    shown = [name for name in ("tremor_share", "resonance_2_share", "harmonic_share") if known.get(name, 0.0) > 0]
+    shown = [
+        name
+        for name in ("tremor_share", "resonance_2_share", "harmonic_share")
+        if known.get(name, 0.0) > 0
+    ]
     return ", ".join(f"{name} {known[name]:.3f}" for name in shown)
 
 
@@ -64,7 +80,9 @@ def consequences(task: jm.Isometric) -> dict[str, float]:
     example = jm.Target("x", np.ones(30), segments=[10] * 10, settings=SETTINGS)
     with jax.enable_x64(True):
         objective = planned(task, example, FitOptions()).problem.linear()
-        values = quantities(objective, expand(objective, np.zeros((1, len(objective.parts[0].coordinates.names)))))[0][0]
+        values = quantities(
+            objective, expand(objective, np.zeros((1, len(objective.parts[0].coordinates.names))))
+        )[0][0]
     return {name: float(value[0]) for name, value in values.items()}
 
 
@@ -81,12 +99,18 @@ def selection(count: int) -> None:
     for design in DESIGNS:
         for rung in range(4):
             task = truth(rung)
-            found = [fitted(target) for target in simulated(task, design, count, 10 * DESIGNS[design][1] + rung)]
+            found = [
+                fitted(target)
+                for target in simulated(task, design, count, 10 * DESIGNS[design][1] + rung)
+            ]
             counts = collections.Counter(map(chosen, found))
             adequate = np.mean([bool(result.adequate) for result in found])
-            print(f"{design}, truth on rung {rung} ({described(task)}): chosen "
-                  + ", ".join(f"{n}: {counts[n]}" for n in range(4))
-                  + f" of {count}; adequate {100 * adequate:.0f} %", flush=True)  # fmt: skip
+            print(
+                f"{design}, truth on rung {rung} ({described(task)}): chosen "
+                + ", ".join(f"{n}: {counts[n]}" for n in range(4))
+                + f" of {count}; adequate {100 * adequate:.0f} %",
+                flush=True,
+            )
 
 
 def line(count: int) -> None:
@@ -97,7 +121,9 @@ def line(count: int) -> None:
         narrow = still.with_parts(noise=still.noise + jm.ResonantNoise(0.005, 9.0, 0.2))
         truths = {
             "line at 4.25 Hz, base model": QUIET,
-            "line at 9 Hz, activation": with_shares(twitch.replace(harmonic_frequency=9.0), {"harmonic": 0.05}),
+            "line at 9 Hz, activation": with_shares(
+                twitch.replace(harmonic_frequency=9.0), {"harmonic": 0.05}
+            ),
             "resonance at 9 Hz, 0.2 Hz wide, activation": with_shares(narrow, {"resonance": 0.05}),
         }
     for design in ("60 s", "ten trials of 15 s"):
@@ -105,15 +131,27 @@ def line(count: int) -> None:
             said: collections.Counter[str] = collections.Counter()
             for target in simulated(task, design, count, 500 + 10 * DESIGNS[design][1] + number):
                 result = fitted(target, check_seeds=8)
-                notices = [notice for notice in result.notices if "a line of zero width (AIC" in notice]
+                notices = [
+                    notice for notice in result.notices if "a line of zero width (AIC" in notice
+                ]
                 said[verdict_of(notices[0] if notices else "") + f" (rung {chosen(result)})"] += 1
-            print(f"{design}, {name} ({described(task)}): " + ", ".join(f"{v} {k}" for k, v in sorted(said.items())),
-                  flush=True)  # fmt: skip
+            print(
+                f"{design}, {name} ({described(task)}): "
+                + ", ".join(f"{v} {k}" for k, v in sorted(said.items())),
+                flush=True,
+            )
 
 
 def verdict_of(notice: str) -> str:
-    endings = {"cannot be told apart": "cannot be told apart", "the line": "line", "the resonance": "resonance"}
-    return next((word for ending, word in endings.items() if ending in notice.partition(")")[2]), "not asked")
+    endings = {
+        "cannot be told apart": "cannot be told apart",
+        "the line": "line",
+        "the resonance": "resonance",
+    }
+    return next(
+        (word for ending, word in endings.items() if ending in notice.partition(")")[2]),
+        "not asked",
+    )
 
 
 def recovery(count: int) -> None:
@@ -133,13 +171,22 @@ def recovery(count: int) -> None:
             values[name].append(result.derived[name].value)
             if name in result.determined:
                 low, high = result.derived[name].interval or (None, None)
-                inside[name].append((low is None or known[name] >= low) and (high is None or known[name] <= high))
+                inside[name].append(
+                    (low is None or known[name] >= low) and (high is None or known[name] <= high)
+                )
     print("chosen " + ", ".join(f"{n}: {counts[n]}" for n in range(4)), flush=True)
     for name, held in inside.items():
         low, middle, high = np.quantile(values[name], (0.025, 0.5, 0.975))
-        share = f"{np.mean(held):.3f} (three binomial errors {3 * np.sqrt(0.0475 / len(held)):.3f})" if held else "never"
-        print(f"{name}: stated {len(held)} times of {count}, holds the truth {share}; "
-              f"median {middle:.4g}, 95 % of the values {low:.4g} to {high:.4g}", flush=True)  # fmt: skip
+        share = (
+            f"{np.mean(held):.3f} (three binomial errors {3 * np.sqrt(0.0475 / len(held)):.3f})"
+            if held
+            else "never"
+        )
+        print(
+            f"{name}: stated {len(held)} times of {count}, holds the truth {share}; "
+            f"median {middle:.4g}, 95 % of the values {low:.4g} to {high:.4g}",
+            flush=True,
+        )
 
 
 STUDIES = {"selection": selection, "line": line, "recovery": recovery}

@@ -18,7 +18,8 @@ class Unequal(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One number; a ratio says to what (`ratio_to`); `target`, if anything is asked, is to be reached, or kept `at_most`."""
+    """One number; a ratio says to what (`ratio_to`); `target`, if anything is asked, is to be
+    reached, or kept `at_most`."""
 
     name: str
     value: float
@@ -76,9 +77,14 @@ def speeds(group: str, taken: Mapping[str, Taken], steps: Mapping[str, int]) -> 
 
 
 def speed_ratio(
-    group: str, taken: Mapping[str, Taken], steps: Mapping[str, int], pair: tuple[str, str], target: float | None = None
+    group: str,
+    taken: Mapping[str, Taken],
+    steps: Mapping[str, int],
+    pair: tuple[str, str],
+    target: float | None = None,
 ) -> list[Row]:
-    """Speed of the first of a pair over that of the second, by wall time and, without target, by processor time.
+    """Speed of the first of a pair over that of the second, by wall time and, without target, by
+    processor time.
 
     Each the median over rounds of the ratio within a round, so that drift cancels.
     """
@@ -92,7 +98,8 @@ def speed_ratio(
 
 
 def require_equal(what: str, ours: Any, other: Any, tolerance: float) -> float:
-    """Largest difference of two arrays of states, each state relative to its largest value. Raises `Unequal`."""
+    """Largest difference of two arrays of states, each state relative to its largest value. Raises
+    `Unequal`."""
     ours, other = np.asarray(ours, dtype=float), np.asarray(other, dtype=float)
     if ours.shape != other.shape:
         raise Unequal(f"{what}: shapes {ours.shape} and {other.shape} differ")

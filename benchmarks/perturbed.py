@@ -1,8 +1,10 @@
-"""Perturbation experiments, simulated with NumPy alone, and what is found in them; the tables of docs/perturbed.md.
+"""Perturbation experiments, simulated with NumPy alone, and what is found in them; the tables of
+docs/perturbed.md.
 
     python benchmarks/perturbed.py PART [--count N]
 
-PART: classical, amplitude, reflex, inertia, active, reference, people, rhythm, richer, linear, seconds, coverage or time.
+PART: classical, amplitude, reflex, inertia, active, reference, people, rhythm, richer, linear,
+seconds, coverage or time.
 
 Takes a minute to a quarter of an hour each.
 """
@@ -24,8 +26,15 @@ from jaxmuscle.fits import _search
 
 TASK = jm.PrescribedLength()
 # The bundled knee extension as fitted, with masses of 0.5 kg
-KNEE = TASK.replace(k_w=4.6e5, k_z=7.8e5, c_w=114.0, c_z=1.8, P_w=5.0, noise_K_w=0.27, noise_K_z=0.002)
-TREMOR = {"activation_time": 0.05, "resonance_amplitude": 0.14, "resonance_frequency": 9.6, "resonance_width": 1.6}
+KNEE = TASK.replace(
+    k_w=4.6e5, k_z=7.8e5, c_w=114.0, c_z=1.8, P_w=5.0, noise_K_w=0.27, noise_K_z=0.002
+)
+TREMOR = {
+    "activation_time": 0.05,
+    "resonance_amplitude": 0.14,
+    "resonance_frequency": 9.6,
+    "resonance_width": 1.6,
+}
 QUICK = {"rungs": 0, "seeds": 0, "check_seeds": 0, "starts": 16}
 
 
@@ -36,15 +45,22 @@ def stiffness(task: jm.PrescribedLength, f: float) -> complex:
 
 def truth(task: jm.PrescribedLength = TASK) -> dict[str, float]:
     """Base stiffness and damping of both tissues."""
-    return {f"{c.upper()}_{j}0": float(task[f"{c}_{j}"]) * float(task[f"{'x' if c == 'k' else 'v'}_ref_{j}"]) ** 2
-            for c in "kc" for j in "wz"}  # fmt: skip
+    return {
+        f"{c.upper()}_{j}0": (
+            float(task[f"{c}_{j}"]) * float(task[f"{'x' if c == 'k' else 'v'}_ref_{j}"]) ** 2
+        )
+        for c in "kc"
+        for j in "wz"
+    }
 
 
 def tangents() -> dict[str, float]:
     """Stiffness of the active tissue, and of both in series, as they are in the hold."""
     x_w = float(jm.response.equilibrium(TASK)[0])
-    return {"K_w_tangent": float(TASK["k_w"]) * (float(TASK["x_ref_w"]) ** 2 + 3 * x_w**2),
-            "tangent_stiffness": stiffness(TASK, 1e-4).real}  # fmt: skip
+    return {
+        "K_w_tangent": float(TASK["k_w"]) * (float(TASK["x_ref_w"]) ** 2 + 3 * x_w**2),
+        "tangent_stiffness": stiffness(TASK, 1e-4).real,
+    }
 
 
 def spread(name: str, values: list[float], stated: list[float], true: float) -> None:
@@ -52,7 +68,11 @@ def spread(name: str, values: list[float], stated: list[float], true: float) -> 
     found, sd = np.mean(values), np.std(values, ddof=1)
     errors = np.array(stated if len(stated) else np.nan)
     inside = 100 * np.mean(np.abs(np.array(values) - true) < 1.96 * errors)
-    print(f"{name:34s} true {true:8.4g}  mean {found:8.4g} ({100 * (found / true - 1):+5.1f} %)  scatter {sd:7.2g}", end="")
+    print(
+        f"{name:34s} true {true:8.4g}  mean {found:8.4g} ({100 * (found / true - 1):+5.1f} %) "
+        f" scatter {sd:7.2g}",
+        end="",
+    )
     print(f"  stated {np.mean(errors):7.2g}  within 1.96 errors {inside:3.0f} %", flush=True)
 
 
@@ -64,23 +84,45 @@ def classical(count: int) -> None:
         k = int(np.argmin(np.abs(responses[0].frequency - f)))
         at = responses[0].frequency[k]
         for part, words in ((np.real, "Re"), (np.imag, "Im")):
-            spread(f"nonparametric {words} H({at:.2f} Hz)", [float(part(r.value[k])) for r in responses],
-                   [float(r.stderr[k]) for r in responses], float(part(stiffness(TASK, at))))  # fmt: skip
+            spread(
+                f"nonparametric {words} H({at:.2f} Hz)",
+                [float(part(r.value[k])) for r in responses],
+                [float(r.stderr[k]) for r in responses],
+                float(part(stiffness(TASK, at))),
+            )
     second = [run.second_order("slow") for run in runs]
     tangent = stiffness(TASK, 1e-4).real
     damping = stiffness(TASK, 1e-4).imag / (2e-4 * np.pi)
     for name, true in (("K", tangent), ("B", damping), ("I", float(TASK["m_z"]))):
-        spread(f"second order {name}", [s[name].value for s in second], [float(s[name].stderr or 0) for s in second], true)
+        spread(
+            f"second order {name}",
+            [s[name].value for s in second],
+            [float(s[name].stderr or 0) for s in second],
+            true,
+        )
     fits = [jm.fit(TASK, run, **QUICK) for run in runs]
     muscles = [fit.task for fit in fits]
     spread("muscle H(0)", [stiffness(task, 1e-4).real for task in muscles], [], tangent)
     for f in (0.5, 1.0, 2.0, 4.0):
         for part, words in ((np.real, "Re"), (np.imag, "Im")):
-            spread(f"muscle {words} H({f:.2f} Hz)", [float(part(stiffness(task, f))) for task in muscles], [],
-                   float(part(stiffness(TASK, f))))  # fmt: skip
-    spread("muscle C(0)", [stiffness(task, 1e-4).imag / (2e-4 * np.pi) for task in muscles], [], damping)
-    spread("muscle m_z", [fit["m_z"].value for fit in fits], [float(fit["m_z"].stderr or 0) for fit in fits],
-           float(TASK["m_z"]))  # fmt: skip
+            spread(
+                f"muscle {words} H({f:.2f} Hz)",
+                [float(part(stiffness(task, f))) for task in muscles],
+                [],
+                float(part(stiffness(TASK, f))),
+            )
+    spread(
+        "muscle C(0)",
+        [stiffness(task, 1e-4).imag / (2e-4 * np.pi) for task in muscles],
+        [],
+        damping,
+    )
+    spread(
+        "muscle m_z",
+        [fit["m_z"].value for fit in fits],
+        [float(fit["m_z"].stderr or 0) for fit in fits],
+        float(TASK["m_z"]),
+    )
     told(fits)
 
 
@@ -89,15 +131,27 @@ def told(fits: list[jm.fits.FitResult], task: jm.PrescribedLength = TASK) -> Non
     for name, true in truth(task).items():
         known = [fit[name] for fit in fits if fit[name].stderr is not None]
         if len(known) > 1:
-            spread(f"muscle {name} (known {len(known)}/{len(fits)})", [p.value for p in known],
-                   [float(p.stderr or 0) for p in known], true)  # fmt: skip
-    print(f"  described: {sum(bool(fit.adequate) for fit in fits)}/{len(fits)}; p "
-          + " ".join(f"{fit.adequacy_p:.2g}" for fit in fits))  # fmt: skip
-    print("  " + "; ".join(sorted({fit.verdict.partition("; ")[2] for fit in fits} - {""})), flush=True)
+            spread(
+                f"muscle {name} (known {len(known)}/{len(fits)})",
+                [p.value for p in known],
+                [float(p.stderr or 0) for p in known],
+                true,
+            )
+    print(
+        f"  described: {sum(bool(fit.adequate) for fit in fits)}/{len(fits)}; p "
+        + " ".join(f"{fit.adequacy_p:.2g}" for fit in fits)
+    )
+    print(
+        "  " + "; ".join(sorted({fit.verdict.partition("; ")[2] for fit in fits} - {""})),
+        flush=True,
+    )
 
 
-def described(task: jm.PrescribedLength, rms: float, rng: np.random.Generator, band: float) -> tuple[np.ndarray, float]:
-    """Departure of the describing function (mean of 64 draws of phases) from H over |H|, by line, and of the mean force."""
+def described(
+    task: jm.PrescribedLength, rms: float, rng: np.random.Generator, band: float
+) -> tuple[np.ndarray, float]:
+    """Departure of the describing function (mean of 64 draws of phases) from H over |H|, by line,
+    and of the mean force."""
     sines = Sines(rng, 20.0, 64, high=band)
     x, v, a = (sines(rms * (2j * np.pi * sines.f) ** n) for n in range(3))
     periods = [np.tile(part, (3, 1)) for part in (x, v, a)]
@@ -108,52 +162,74 @@ def described(task: jm.PrescribedLength, rms: float, rng: np.random.Generator, b
     found = np.mean(answer / moved, axis=1)
     linear = np.array([stiffness(task, f) for f in sines.f])
     resting = force(task, *(np.zeros((len(x), 1)) for _ in range(6)))[-1, 0]
-    return np.stack(
-        [np.abs(found - linear) / np.abs(linear), np.abs(found), np.abs(linear), sines.f]
-    ), F.mean() / resting - 1
+    return (
+        np.stack([np.abs(found - linear) / np.abs(linear), np.abs(found), np.abs(linear), sines.f]),
+        F.mean() / resting - 1,
+    )
 
 
 def agreement(rms: float) -> str:
-    """The integrator of these programs, and `jaxmuscle.simulate`, against `scipy.integrate.solve_ivp`."""
+    """The integrator of these programs, and `jaxmuscle.simulate`, against
+    `scipy.integrate.solve_ivp`."""
     sines = Sines(np.random.default_rng(6), 10.0, 1)
     s = 2j * np.pi * sines.f
     signals = [sines(rms * s**n) for n in range(3)]
     time = DT * np.arange(sines.samples)
     x, v, _ = (scipy.interpolate.CubicSpline(time, part[:, 0]) for part in signals)
-    m_w, P_w, k_w, k_z, c_w, c_z = (float(TASK[n]) for n in ("m_w", "P_w", "k_w", "k_z", "c_w", "c_z"))
+    m_w, P_w, k_w, k_z, c_w, c_z = (
+        float(TASK[n]) for n in ("m_w", "P_w", "k_w", "k_z", "c_w", "c_z")
+    )
 
     def passive(t: float, y: np.ndarray) -> float:
-        return k_z * (TASK["x_ref_z"] ** 2 + x(t) ** 2) * (x(t) - y[0]) + c_z * (1 + v(t) ** 2) * (v(t) - y[1])
+        return k_z * (TASK["x_ref_z"] ** 2 + x(t) ** 2) * (x(t) - y[0]) + c_z * (1 + v(t) ** 2) * (
+            v(t) - y[1]
+        )
 
     def slope(t: float, y: np.ndarray) -> list[float]:
         own = k_w * (TASK["x_ref_w"] ** 2 + y[0] ** 2) * y[0] + c_w * (1 + y[1] ** 2) * y[1]
         return [y[1], (P_w - own + passive(t, y)) / m_w]
 
     at = time[time >= 3.0][:-8:8]
-    path = scipy.integrate.solve_ivp(slope, (0, 10), [0.01, 0.0], "DOP853", at, rtol=1e-10, atol=1e-12)
-    wanted = np.array([-passive(t, y) for t, y in zip(at, path.y.T, strict=True)]) - 0.5 * signals[2][time >= 3.0][:-8:8, 0]
+    path = scipy.integrate.solve_ivp(
+        slope, (0, 10), [0.01, 0.0], "DOP853", at, rtol=1e-10, atol=1e-12
+    )
+    wanted = (
+        np.array([-passive(t, y) for t, y in zip(at, path.y.T, strict=True)])
+        - 0.5 * signals[2][time >= 3.0][:-8:8, 0]
+    )
     none = np.zeros_like(signals[0])
     own = np.interp(at, time[::2], force(TASK, *signals, none, none, none)[:, 0])
-    moved = TASK.replace(noise_K_w=0.0, noise_K_z=0.0, noise_C_w=0.0, noise_C_z=0.0, harmonic_amplitude=0.0)
+    moved = TASK.replace(
+        noise_K_w=0.0, noise_K_z=0.0, noise_C_w=0.0, noise_C_z=0.0, harmonic_amplitude=0.0
+    )
     moved = moved.with_parts(x_z=jm.model.Sampled.through(time, signals[0][:, 0]))
     run = jm.simulate(moved, jax.random.key(0), duration=9.9, rate=100, sampling="instant")
     theirs = np.asarray(run.output)[np.rint(100 * at[at < 9.9]).astype(int)]
-    return ", ".join(f"{name} {np.max(np.abs(f - wanted[: f.size])) / np.std(wanted):.1e}"
-                     for name, f in (("NumPy", own), ("simulate", theirs)))  # fmt: skip
+    return ", ".join(
+        f"{name} {np.max(np.abs(f - wanted[: f.size])) / np.std(wanted):.1e}"
+        for name, f in (("NumPy", own), ("simulate", theirs))
+    )
 
 
 def amplitude(count: int) -> None:
     """From which amplitude on the muscle's response is not the linear one."""
     for rms in (1e-3, 8e-3):
-        print(f"rms {1e3 * rms:g} mm, largest difference from scipy over the rms of the force: {agreement(rms)}", flush=True)
+        print(
+            f"rms {1e3 * rms:g} mm, largest difference from scipy over the rms of the force:"
+            f" {agreement(rms)}",
+            flush=True,
+        )
     for words, task in (("default, 2.2 N", TASK), ("carried to 40 N", jm.at_force(TASK, 40.0))):
         for band in (2.0, 5.0):
             for rms in (0.1e-3, 0.3e-3, 1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 8e-3):
                 (off, _, size, f), mean = described(task, rms, np.random.default_rng(2), band)
                 total = np.sqrt(np.mean((off * size) ** 2) / np.mean(size**2))
                 worst = f"largest {100 * off.max():6.2f} % at {f[off.argmax()]:.2f} Hz"
-                print(f"{words:18s} to {band:g} Hz, rms {1e3 * rms:4.1f} mm: {worst}, rms {100 * total:5.2f} %, mean force "
-                      f"{100 * mean:+.2f} %", flush=True)  # fmt: skip
+                print(
+                    f"{words:18s} to {band:g} Hz, rms {1e3 * rms:4.1f} mm: {worst}, rms"
+                    f" {100 * total:5.2f} %, mean force {100 * mean:+.2f} %",
+                    flush=True,
+                )
 
 
 def reflex(count: int) -> None:
@@ -169,10 +245,22 @@ def reflex(count: int) -> None:
             fits = [jm.fit(TASK, run, **QUICK) for run in runs]
             told(fits)
             for name, true in tangents().items():
-                off = [100 * (fit[name].value / true - 1) for fit in fits if fit[name].stderr is not None]
-                print(f"muscle {name}: known {len(off)}/{count}, off by {np.mean(off) if off else np.nan:+.0f} % (mean)")
+                off = [
+                    100 * (fit[name].value / true - 1)
+                    for fit in fits
+                    if fit[name].stderr is not None
+                ]
+                print(
+                    f"muscle {name}: known {len(off)}/{count}, off by"
+                    f" {np.mean(off) if off else np.nan:+.0f} % (mean)"
+                )
             masses = [fit["m_z"] for fit in fits]
-            spread("muscle m_z", [m.value for m in masses], [float(m.stderr or np.nan) for m in masses], float(TASK["m_z"]))
+            spread(
+                "muscle m_z",
+                [m.value for m in masses],
+                [float(m.stderr or np.nan) for m in masses],
+                float(TASK["m_z"]),
+            )
             if strength == 1.0:
                 print("the same, fitted with the true m_z")
                 told([jm.fit(TASK, run, fix={"m_z": float(TASK["m_z"])}, **QUICK) for run in runs])
@@ -183,13 +271,16 @@ def inertia(count: int) -> None:
     for mass in (0.02, 0.1):
         runs = recorded(TASK, np.random.default_rng(4), count, mass=mass)
         for fixed in (0.5, 0.5 + mass):
-            print(f"rig {mass:g} kg, fitted with m_z = {fixed:g} kg; second order I: "
-                  f"{np.mean([run.second_order('slow')['I'].value for run in runs]):.3f}")  # fmt: skip
+            print(
+                f"rig {mass:g} kg, fitted with m_z = {fixed:g} kg; second order I: "
+                f"{np.mean([run.second_order('slow')['I'].value for run in runs]):.3f}"
+            )
             told([jm.fit(TASK, run, fix={"m_z": fixed}, **QUICK) for run in runs])
 
 
 def active(count: int) -> None:
-    """Muscles of another active mass m_w than the fit begins with: m_w free, as by default, and held at 0.5 kg."""
+    """Muscles of another active mass m_w than the fit begins with: m_w free, as by default, and
+    held at 0.5 kg."""
     free: dict[str, Any] = {}
     for mass in (0.2, 0.5, 1.25):
         runs = recorded(TASK.replace(m_w=mass), np.random.default_rng(11), count)
@@ -209,25 +300,45 @@ def reference(count: int) -> None:
     true = truth() | tangents()
     for length in (0.010, 0.015, 0.020, 0.030, 0.040):
         scale = (0.02 / length) ** 2
-        task = TASK.replace(x_ref_w=length, x_ref_z=length, **{k: scale * float(TASK[k]) for k in ("k_w", "k_z")})
+        task = TASK.replace(
+            x_ref_w=length, x_ref_z=length, **{k: scale * float(TASK[k]) for k in ("k_w", "k_z")}
+        )
         fits = [jm.fit(task, run, **QUICK) for run in runs]
-        off = {name: 100 * (np.mean([fit[name].value for fit in fits]) / value - 1) for name, value in true.items()}
-        print(f"x_ref {1e3 * length:g} mm: " + ", ".join(f"{name} {change:+.0f} %" for name, change in off.items()))
-        print(f"  described: {sum(bool(fit.adequate) for fit in fits)}/{count}; p "
-              + " ".join(f"{fit.adequacy_p:.2g}" for fit in fits), flush=True)  # fmt: skip
+        off = {
+            name: 100 * (np.mean([fit[name].value for fit in fits]) / value - 1)
+            for name, value in true.items()
+        }
+        print(
+            f"x_ref {1e3 * length:g} mm: "
+            + ", ".join(f"{name} {change:+.0f} %" for name, change in off.items())
+        )
+        print(
+            f"  described: {sum(bool(fit.adequate) for fit in fits)}/{count}; p "
+            + " ".join(f"{fit.adequacy_p:.2g}" for fit in fits),
+            flush=True,
+        )
 
 
 def people(count: int) -> None:
-    """Muscles softer and stiffer than the default one of the same force, with and without a tremor."""
+    """Muscles softer and stiffer than the default one of the same force, with and without a
+    tremor."""
     for factor in (0.1, 0.3, 3.0):  # more is too fast for the steps of `recorded`
-        muscle = TASK.replace(**{name: factor * float(TASK[name]) for name in ("k_w", "k_z", "c_w", "c_z")})
+        muscle = TASK.replace(
+            **{name: factor * float(TASK[name]) for name in ("k_w", "k_z", "c_w", "c_z")}
+        )
         shaking = jm.on_rung(muscle, 2).replace(**TREMOR)
-        runs = {"noise alone": recorded(muscle, np.random.default_rng(14), count), "tremor": _simulated(shaking, count)}
+        runs = {
+            "noise alone": recorded(muscle, np.random.default_rng(14), count),
+            "tremor": _simulated(shaking, count),
+        }
         for words, moved in runs.items():
             print(f"stiffness and damping times {factor:g}, {words}")
             fits = [jm.fit(TASK, run, seeds=0, check_seeds=0) for run in moved]
             told(fits, muscle)
-            print("  richest model tried: " + ", ".join(str(len(fit.ladder) - 1) for fit in fits), flush=True)
+            print(
+                "  richest model tried: " + ", ".join(str(len(fit.ladder) - 1) for fit in fits),
+                flush=True,
+            )
             _held(fits, truth(muscle))
 
 
@@ -236,12 +347,18 @@ def _held(fits: list[jm.fits.FitResult], true: dict[str, float]) -> None:
     print("  95 % intervals that hold the truth:", end="")
     for name, value in true.items():
         known = [fit[name].interval for fit in fits if fit[name].interval is not None]
-        print(f" {name} {sum(low < value < high for low, high in known)} of {len(known)} known;", end="")
+        print(
+            f" {name} {sum(low < value < high for low, high in known)} of {len(known)} known;",
+            end="",
+        )
     print(flush=True)
 
 
-def _simulated(muscle: jm.PrescribedLength, count: int, lines: np.ndarray = np.r_[30:300]) -> list[jm.PerturbedRecording]:
-    """A minute of the muscle moved at these lines [1/60 Hz], 1 mm rms, by the package's own simulation."""
+def _simulated(
+    muscle: jm.PrescribedLength, count: int, lines: np.ndarray = np.r_[30:300]
+) -> list[jm.PerturbedRecording]:
+    """A minute of the muscle moved at these lines [1/60 Hz], 1 mm rms, by the package's own
+    simulation."""
     rng, rate, runs = np.random.default_rng(13), 100, []
     time = np.arange(90 * rate + 1) / rate
     for seed in range(count):
@@ -258,23 +375,39 @@ def rhythm(count: int) -> None:
     """A sine of 4.25 Hz in both stiffnesses, and none: fitted as by default, and by noise alone."""
     for line in (0.003, 0.0):
         runs = recorded(TASK, np.random.default_rng(12), count, line=line)
-        for words, task in (("by default", TASK), ("by noise alone", TASK.replace(harmonic_amplitude=0.0))):
+        for words, task in (
+            ("by default", TASK),
+            ("by noise alone", TASK.replace(harmonic_amplitude=0.0)),
+        ):
             fits = [jm.fit(task, run, **QUICK) for run in runs]
             found = sum("harmonic_frequency" in fit.free for fit in fits)
             print(f"amplitude {line:g}, fitted {words}: a harmonic in {found}/{count}")
             told(fits)
             for name, true in truth().items():
-                off = [(fit[name].value - true) / fit[name].stderr for fit in fits if fit[name].stderr is not None]
+                off = [
+                    (fit[name].value - true) / fit[name].stderr
+                    for fit in fits
+                    if fit[name].stderr is not None
+                ]
                 print(
-                    f"  {name}: over the stated error: mean {np.mean(off):+.2f}, scatter {np.std(off, ddof=1):.2f}",
+                    f"  {name}: over the stated error: mean {np.mean(off):+.2f}, scatter"
+                    f" {np.std(off, ddof=1):.2f}",
                     flush=True,
                 )
 
 
 def richer(count: int) -> None:
-    """A strong muscle with a tremor, moved in two bands or evenly: its response taken off by the base model's muscle, or by
-    the one that is found."""
-    true = {"k_w": 1.61e7, "k_z": 1.61e7, "c_w": 1360.0, "c_z": 168.0, "P_w": 141.0, "noise_K_w": 0.27, "noise_K_z": 0.0013}
+    """A strong muscle with a tremor, moved in two bands or evenly: its response taken off by the
+    base model's muscle, or by the one that is found."""
+    true = {
+        "k_w": 1.61e7,
+        "k_z": 1.61e7,
+        "c_w": 1360.0,
+        "c_z": 168.0,
+        "P_w": 141.0,
+        "noise_K_w": 0.27,
+        "noise_K_z": 0.0013,
+    }
     muscle = jm.on_rung(TASK, 2).replace(**true, **TREMOR)
     bands = {"two bands": np.r_[28:36, 170:200], "even": np.r_[30:300]}
     for words, lines in bands.items():
@@ -289,7 +422,8 @@ def richer(count: int) -> None:
 
 
 def linear(count: int) -> None:
-    """Linear specimens whose force fluctuates in its own way: one spring, damper and mass, and two parts in series."""
+    """Linear specimens whose force fluctuates in its own way: one spring, damper and mass, and two
+    parts in series."""
     rate, length = 500.0, 66_000 // 2
     f = np.fft.rfftfreq(length, 1 / rate)
     s = 2j * np.pi * f
@@ -302,26 +436,50 @@ def linear(count: int) -> None:
     specimens = {
         "one spring of 400 N/m": (400 + 10 * s + 0.3 * s**2, 1.2, 0.0, 400.0),
         "one spring of 3000 N/m, tremor": (3000 + 20 * s + 0.3 * s**2, 1.0, 0.03, 3000.0),
-        "two parts in series, tremor": (two[0] * two[1] / (two[0] + two[1]) + 0.5 * s**2, 1.0, 0.03, 4000 / 3),
+        "two parts in series, tremor": (
+            two[0] * two[1] / (two[0] + two[1]) + 0.5 * s**2,
+            1.0,
+            0.03,
+            4000 / 3,
+        ),
     }
     for words, (answer, corner, tremor, true) in specimens.items():
         fits, apart, rng = [], [], np.random.default_rng(21)
         for _ in range(count):
             x = 1e-3 * shaped(rng, ((f >= 0.5) & (f <= 10)).astype(float))
-            own = 0.2 * shaped(rng, 1 / (1 + (f / corner) ** 2)) + 0.003 * rng.standard_normal(length)
+            own = 0.2 * shaped(rng, 1 / (1 + (f / corner) ** 2)) + 0.003 * rng.standard_normal(
+                length
+            )
             own += tremor * shaped(rng, 1 / np.hypot(f**2 - 8.5**2, 0.8 * f))
             force = 20.0 + own + np.fft.irfft(np.fft.rfft(x) * answer, length)
-            record = jm.PerturbedRecording.from_array(force, x, rate, positive="lengthening").steady((3.0, 63.0))
+            record = jm.PerturbedRecording.from_array(
+                force, x, rate, positive="lengthening"
+            ).steady((3.0, 63.0))
             fits.append(jm.fit(TASK, record, seeds=0, check_seeds=0))
             seen = fits[-1].target
-            right = jm.Recording.from_array(20.0 + own, rate).steady(record.force.window).target(settings=seen.settings)
+            right = (
+                jm.Recording.from_array(20.0 + own, rate)
+                .steady(record.force.window)
+                .target(settings=seen.settings)
+            )
             apart.append(np.log(seen.proportional_power / right.proportional_power))
-        print(f"{words}; fluctuations off by {np.sqrt(np.mean(np.square(apart))):.3f} (rms of the log)")
+        print(
+            f"{words}; fluctuations off by {np.sqrt(np.mean(np.square(apart))):.3f} (rms of the"
+            " log)"
+        )
         alone = [jm.fit(TASK, fit.target.stiffness) for fit in fits]
         for which, some in (("", fits), (", response alone", alone)):
-            known = [fit["tangent_stiffness"] for fit in some if fit["tangent_stiffness"].stderr is not None]
-            spread(f"tangent stiffness{which} ({len(known)}/{count})", [p.value for p in known],
-                   [float(p.stderr or 0) for p in known], true)  # fmt: skip
+            known = [
+                fit["tangent_stiffness"]
+                for fit in some
+                if fit["tangent_stiffness"].stderr is not None
+            ]
+            spread(
+                f"tangent stiffness{which} ({len(known)}/{count})",
+                [p.value for p in known],
+                [float(p.stderr or 0) for p in known],
+                true,
+            )
         print(f"  described: {sum(bool(fit.adequate) for fit in fits)}/{count}", flush=True)
 
 
@@ -329,11 +487,17 @@ def seconds(count: int) -> None:
     """Errors over the length of the recording, and over the amplitude."""
     for length, rms in ((30.0, 1e-3), (60.0, 1e-3), (120.0, 1e-3), (60.0, 0.5e-3), (60.0, 2e-3)):
         print(f"{length:g} s, {1e3 * rms:g} mm rms")
-        told([jm.fit(TASK, run, **QUICK) for run in recorded(TASK, np.random.default_rng(5), count, length, rms)])
+        told(
+            [
+                jm.fit(TASK, run, **QUICK)
+                for run in recorded(TASK, np.random.default_rng(5), count, length, rms)
+            ]
+        )
 
 
 def coverage(count: int) -> None:
-    """Are the errors right: those of 64 s of the knee extension, against how far the fits scatter about the truth."""
+    """Are the errors right: those of 64 s of the knee extension, against how far the fits scatter
+    about the truth."""
     rng, fits = np.random.default_rng(7), list[jm.fits.FitResult]()
     for first in range(0, count, 20):  # so many simulations at once
         runs = recorded(KNEE, rng, min(20, count - first), 64.0)
@@ -347,24 +511,41 @@ def coverage(count: int) -> None:
         stated = np.array([p.stderr for p in known], float)
         z = (np.array([p.value for p in known]) - true) / stated
         held = np.mean([p.interval[0] < true < p.interval[1] for p in known])
-        print(f"{name:10s} true {true:8.4g}  known {len(known)}/{count}  stated {100 * np.median(stated) / true:5.2f} %  "
-              f"over stated: scatter {np.std(z, ddof=1):.2f}, mean {np.mean(z):+.2f}  95 % intervals hold the truth: "
-              f"{100 * held:.0f} %", flush=True)  # fmt: skip
+        print(
+            f"{name:10s} true {true:8.4g}  known {len(known)}/{count}  stated"
+            f" {100 * np.median(stated) / true:5.2f} %  over stated: scatter"
+            f" {np.std(z, ddof=1):.2f}, mean {np.mean(z):+.2f}  95 % intervals hold the truth:"
+            f" {100 * held:.0f} %",
+            flush=True,
+        )
     p = np.array([fit.adequacy_p for fit in fits], float)
-    print(f"described: {sum(bool(fit.adequate) for fit in fits)}/{count}; p below 0.05: {np.sum(p < 0.05)}", flush=True)
+    print(
+        f"described: {sum(bool(fit.adequate) for fit in fits)}/{count}; p below 0.05:"
+        f" {np.sum(p < 0.05)}",
+        flush=True,
+    )
 
 
 def time(count: int) -> None:
-    """Processor time, when warm, of a whole fit of a minute moved, of a minute held and of the bundled spectrum."""
+    """Processor time, when warm, of a whole fit of a minute moved, of a minute held and of the
+    bundled spectrum."""
     (moved,) = recorded(KNEE, np.random.default_rng(8), 1)
     (held,) = recorded(KNEE, np.random.default_rng(9), 1, rms=1e-9)  # m, which no force shows
     spectrum = jm.load_target("vastus-lateralis-26mvc")
-    given = {"moved": (TASK, moved), "held": (jm.Isometric(), held.force), "spectrum": (jm.task_for(spectrum), spectrum)}
+    given = {
+        "moved": (TASK, moved),
+        "held": (jm.Isometric(), held.force),
+        "spectrum": (jm.task_for(spectrum), spectrum),
+    }
     taken = timed({name: lambda pair=pair: jm.fit(*pair) for name, pair in given.items()}, count)
     for name, found in taken.items():
         ratio = np.median(taken["moved"].processor / found.processor)
-        print(f"{name:10s} processor time {np.median(found.processor):6.2f} s (wall {np.median(found.wall):6.2f} s), "
-              f"median of {count} turns; that of a minute moved over it {ratio:.2f}", flush=True)  # fmt: skip
+        print(
+            f"{name:10s} processor time {np.median(found.processor):6.2f} s (wall"
+            f" {np.median(found.wall):6.2f} s), median of {count} turns; that of a minute moved"
+            f" over it {ratio:.2f}",
+            flush=True,
+        )
 
 
 PARTS: dict[str, Callable[[int], None]] = {
@@ -389,7 +570,9 @@ PARTS: dict[str, Callable[[int], None]] = {
 
 def main() -> None:
     """Run one part."""
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     arguments.add_argument("part", choices=PARTS)
     arguments.add_argument("--count", type=int, default=20, help="recordings")
     given = arguments.parse_args()

@@ -11,13 +11,15 @@ from measure import Row
 
 HOUR, RATE = 3600, 2000
 STEPS = ("load", "steady", "spectrum", "target", "summary")
-# Each step in turn in one fresh process; the peak of its memory is that above what the imports need.
+# Each step in turn in one fresh process; the peak of its memory is that above what the imports
+# need.
 PROGRAM = """
 import json, resource, sys, time
 import pandas, scipy.ndimage, scipy.signal
 import jaxmuscle as jm
 def peak():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 jm.Recording(__import__("numpy").arange(9999) % 7, 100).summary()
 before, taken, start = peak(), {}, time.process_time()
 def step(name, result):
@@ -26,7 +28,8 @@ def step(name, result):
     return result
 recording = step("load", jm.load_recording(sys.argv[1]))
 taken["bytes"] = (peak() - before) / recording.whole.size
-recording = step("steady", recording.steady(None if sys.argv[2] == "found" else (0.0, recording.stop)))
+window = None if sys.argv[2] == "found" else (0.0, recording.stop)
+recording = step("steady", recording.steady(window))
 for name in ("spectrum", "target", "summary"):
     step(name, getattr(recording, name)())
 print(json.dumps(taken))
@@ -41,7 +44,13 @@ def rows() -> list[Row]:
         given, found = (_taken(path, window) for window in ("given", "found"))
     name = "one hour at 2 kHz, text"
     return [
-        Row(f"{name}: all steps, processor time", sum(given[step] for step in STEPS), "s", target=20, at_most=True),
+        Row(
+            f"{name}: all steps, processor time",
+            sum(given[step] for step in STEPS),
+            "s",
+            target=20,
+            at_most=True,
+        ),
         *(Row(f"{name}: {step}", given[step], "s") for step in STEPS),
         Row(f"{name}: steady, window found", found["steady"], "s"),
         Row(f"{name}: memory to load it", given["bytes"], "bytes a row", target=120, at_most=True),
@@ -63,5 +72,7 @@ def _write(path: Path) -> None:
 
 
 def _taken(path: Path, window: str) -> dict[str, float]:
-    done = subprocess.run([sys.executable, "-c", PROGRAM, path, window], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, path, window], capture_output=True, text=True, check=True
+    )
     return json.loads(done.stdout)

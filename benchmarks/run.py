@@ -46,7 +46,9 @@ SECTIONS: dict[str, Callable[[int], list[Row]]] = {
 def machine() -> dict[str, Any]:
     """What the numbers depend on."""
     return {
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": (
+            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        ),
         "processor": _processor(),
         "backend": jax.default_backend(),
         "python": platform.python_version(),
@@ -59,24 +61,38 @@ def machine() -> dict[str, Any]:
 def _processor() -> str:
     facts = Path("/proc/cpuinfo")
     lines = facts.read_text().splitlines() if facts.exists() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
+    return next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
+        platform.processor(),
+    )
 
 
 def write(path: Path, value: Any) -> None:
     """Write JSON whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".json", delete=False, encoding="utf-8") as file:
+    with tempfile.NamedTemporaryFile(
+        "w", dir=path.parent, suffix=".json", delete=False, encoding="utf-8"
+    ) as file:
         json.dump(value, file, indent=1)
     os.replace(file.name, path)
 
 
 def main() -> int:
-    """Run the chosen sections, print their rows, write the file. 1 if programs that must agree do not, else 0."""
+    """Run the chosen sections, print their rows, write the file. 1 if programs that must agree do
+    not, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/bench.json"))
-    parser.add_argument("--repetitions", type=int, default=9, help="of each timed program (default 9)")
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), metavar="SECTION",
-                        help=f"some of {', '.join(SECTIONS)} (default: all)")  # fmt: skip
+    parser.add_argument(
+        "--repetitions", type=int, default=9, help="of each timed program (default 9)"
+    )
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=SECTIONS,
+        default=list(SECTIONS),
+        metavar="SECTION",
+        help=f"some of {', '.join(SECTIONS)} (default: all)",
+    )
     options = parser.parse_args()
     jax.config.update("jax_enable_compilation_cache", False)
     os.environ["JAXMUSCLE_CACHE"] = "off"  # what is measured here is compiled here
@@ -93,7 +109,9 @@ def main() -> int:
         rows += found
         print(*found, f"({name}: {time.perf_counter() - start:.0f} s)", "", sep="\n", flush=True)
     facts["load_after"] = os.getloadavg()
-    write(options.out, {"machine": facts, "unequal": unequal, "rows": [row.as_dict() for row in rows]})
+    write(
+        options.out, {"machine": facts, "unequal": unequal, "rows": [row.as_dict() for row in rows]}
+    )
     _conclude(rows, unequal, facts)
     return 1 if unequal else 0
 

@@ -1,4 +1,5 @@
-"""Ensembles at scale: against the best hand-written scans, numba and C; threads, processes, memory, single precision."""
+"""Ensembles at scale: against the best hand-written scans, numba and C; threads, processes, memory,
+single precision."""
 
 import contextlib
 import json
@@ -34,47 +35,67 @@ KEPT, BEST = "jaxmuscle, Gaussian, states kept", "hand-written batched lax.scan"
 
 
 def _same_law(label: str, programs: dict[str, Any], ours: Any) -> None:
-    """Other noise of the same law: the sd of 1024 seeds has a standard error of 2.2 %, the mean one of 3.1 % of it."""
+    """Other noise of the same law: the sd of 1024 seeds has a standard error of 2.2 %, the mean one
+    of 3.1 % of it."""
     spread = float(np.std(ours))
     for name, program in programs.items():
         last = np.asarray(program())
         far = abs(float(np.mean(last)) - float(np.mean(ours))) / spread
         if not (abs(np.log(float(np.std(last)) / spread)) < 0.14 and far < 0.2):
-            raise Unequal(f"{label}, {name}: mean {np.mean(last):.6g}, sd {np.std(last):.3g} of x_z, not sd {spread:.3g}")
+            raise Unequal(
+                f"{label}, {name}: mean {np.mean(last):.6g}, sd {np.std(last):.3g} of x_z, not sd"
+                f" {spread:.3g}"
+            )
 
 
 def against(label: str, noise: Any, by_hand: Any, repetitions: int) -> list[Row]:
-    """One block of seeds by diffrax with each kind of random numbers, by hand and by C, on one core.
+    """One block of seeds by diffrax with each kind of random numbers, by hand and by C, on one
+    core.
 
-    Every tenth output is kept, as for `reduce`; against the scan by hand, which does so, all states.
+    Every tenth output is kept, as for `reduce`; against the scan by hand, which does so, all
+    states.
     """
     task, key = as_arrays(jm.PrescribedForce(noise=noise)), jax.random.key(0)
     hand, grid = eqx.filter_jit(by_hand), Grid(DT, STEPS, EVERY, reverse=False)
 
     @eqx.filter_jit
     def ours(task, key, draws, states):
-        streams = jax.vmap(lambda i: Stream.of(jax.random.fold_in(key, i), draws))(jnp.arange(SEEDS))
+        streams = jax.vmap(lambda i: Stream.of(jax.random.fold_in(key, i), draws))(
+            jnp.arange(SEEDS)
+        )
         found = integrated((task,), streams, grid, "instant", states=states)
         return found.states if states else found.outputs[0]
 
     kinds = {OURS: Draws(), WEAK: Draws(increments="weak"), THREEFRY: Draws(generator="threefry")}
-    programs: dict[str, Any] = {name: partial(ours, task, key, draws, False) for name, draws in kinds.items()}
+    programs: dict[str, Any] = {
+        name: partial(ours, task, key, draws, False) for name, draws in kinds.items()
+    }
     programs |= {KEPT: partial(ours, task, key, Draws(), True), BEST: partial(hand, task, key)}
     compared = anchors(task)
-    last: dict[str, Any] = {name: (lambda name=name: programs[name]()[:, -1]) for name in (WEAK, THREEFRY)}
-    last |= {name: (lambda name=name: programs[name]()[:, -1, 2]) for name in (KEPT, BEST)}
+    last: dict[str, Any] = {
+        name: lambda name=name: programs[name]()[:, -1] for name in (WEAK, THREEFRY)
+    }
+    last |= {name: lambda name=name: programs[name]()[:, -1, 2] for name in (KEPT, BEST)}
     _same_law(label, last | compared, np.asarray(programs[OURS]())[:, -1])
     programs |= compared
     with one_core():
         taken = seconds(programs, repetitions)
     steps = dict.fromkeys(programs, SEEDS * STEPS)
-    found = [Row(f"{label}: {name}", float(np.median(each.processor) / steps[name] * 1e9), "ns per seed and step")
-             for name, each in taken.items()]  # fmt: skip
+    found = [
+        Row(
+            f"{label}: {name}",
+            float(np.median(each.processor) / steps[name] * 1e9),
+            "ns per seed and step",
+        )
+        for name, each in taken.items()
+    ]
     asked = [(KEPT, BEST, 2.0), (OURS, ANCHOR, 0.25), (WEAK, ANCHOR, 0.6), (THREEFRY, ANCHOR, None)]
     for name, other, target in asked:
         if other in taken:
             ratio = float(np.median(taken[other].processor / taken[name].processor))
-            found.append(Row(f"{label}: speed of {name} by processor time", ratio, "times", other, target))
+            found.append(
+                Row(f"{label}: speed of {name} by processor time", ratio, "times", other, target)
+            )
     return found
 
 
@@ -96,18 +117,25 @@ def _pin(cores: set[int]) -> None:
 
 
 def reduced(repetitions: int) -> list[Row]:
-    """`ensemble(reduce=True)` of the default `Isometric` with its spectra and control variate; on one core."""
+    """`ensemble(reduce=True)` of the default `Isometric` with its spectra and control variate; on
+    one core."""
     task, key, seeds, found = jm.Isometric(), jax.random.key(0), 4096, []
     programs = {
-        name: partial(jm.ensemble, task, key, seeds=seeds, reduce=True, increments=name) for name in ("gaussian", "weak")
+        name: partial(jm.ensemble, task, key, seeds=seeds, reduce=True, increments=name)
+        for name in ("gaussian", "weak")
     }
     with one_core():
-        taken = seconds({name: (lambda run=run: run().mean) for name, run in programs.items()}, repetitions)
+        taken = seconds(
+            {name: lambda run=run: run().mean for name, run in programs.items()}, repetitions
+        )
     for name, each in taken.items():
         pace = float(np.median(each.processor)) / (seeds * 15_000) * 1e9
         found.append(Row(f"reduced Isometric, {name}", pace, "ns per seed and step"))
     ratio = float(np.median(taken["gaussian"].processor / taken["weak"].processor))
-    return [*found, Row("reduced Isometric: speed of weak by processor time", ratio, "times", "gaussian")]
+    return [
+        *found,
+        Row("reduced Isometric: speed of weak by processor time", ratio, "times", "gaussian"),
+    ]
 
 
 WORKER = """
@@ -117,7 +145,9 @@ os.sched_setaffinity(0, cores)
 import jax
 import jaxmuscle as jm
 task, key = jm.PrescribedForce(noise=jm.WhiteNoise()), jax.random.key(0)
-run = lambda: jm.ensemble(task, key, seeds=seeds, duration=1.0, control=False, reduce=True, threads=threads)
+run = lambda: jm.ensemble(
+    task, key, seeds=seeds, duration=1.0, control=False, reduce=True, threads=threads
+)
 run()
 print("ready", flush=True)
 for line in sys.stdin:
@@ -131,7 +161,9 @@ def _worker(cores: list[int], threads: int, seeds: int) -> subprocess.Popen:
     """An ensemble in a process, with XLA_FLAGS as the command `jaxmuscle ensemble` sets them."""
     program = [sys.executable, "-c", WORKER, json.dumps([cores, threads, seeds])]
     flags = {"XLA_FLAGS": UNDIVIDED_LOOPS} | os.environ
-    worker = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=flags)
+    worker = subprocess.Popen(
+        program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=flags
+    )
     assert worker.stdout is not None and worker.stdout.readline().strip() == "ready"
     return worker
 
@@ -145,7 +177,8 @@ def _ask(workers: list[subprocess.Popen]) -> float:
 
 
 def threads(repetitions: int) -> list[Row]:
-    """A reduced ensemble on two threads of one process, on two processes of one, against one core; turn by turn."""
+    """A reduced ensemble on two threads of one process, on two processes of one, against one core;
+    turn by turn."""
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         return []
@@ -163,7 +196,8 @@ def threads(repetitions: int) -> list[Row]:
         worker.kill()
         worker.wait()
     found = [
-        Row(f"threads: {name}", seeds * 1e3 / np.median(times) / 1e6, "million steps/s") for name, times in taken.items()
+        Row(f"threads: {name}", seeds * 1e3 / np.median(times) / 1e6, "million steps/s")
+        for name, times in taken.items()
     ]
     for name, target in (("two threads", 1.8), ("two processes", None)):
         ratio = float(np.median(np.array(taken["one core"]) / np.array(taken[name])))
@@ -172,7 +206,8 @@ def threads(repetitions: int) -> list[Row]:
 
 
 class Pace(NamedTuple):
-    """Of `jaxmuscle ensemble`: seconds of the whole command for few seeds; seeds per second of wall and of processor time.
+    """Of `jaxmuscle ensemble`: seconds of the whole command for few seeds; seeds per second of wall
+    and of processor time.
 
     These are reckoned by how much longer it takes for many more.
     """
@@ -183,12 +218,15 @@ class Pace(NamedTuple):
 
 
 def processes(repetitions: int) -> list[Row]:
-    """`jaxmuscle ensemble` as one process, as several of `jax.distributed` on the loopback, and as parts that do not know of
-    each other, with their merging. On a core each, or left to find one."""
+    """`jaxmuscle ensemble` as one process, as several of `jax.distributed` on the loopback, and as
+    parts that do not know of each other, with their merging. On a core each, or left to find
+    one."""
     cores = sorted(os.sched_getaffinity(0))
     ways = {"1": (1, _parts, None)}
     ways |= {
-        f"{count} {name}": (count, way, None) for name, way in (("joined", _joined), ("parts", _parts)) for count in (2, 4)
+        f"{count} {name}": (count, way, None)
+        for name, way in (("joined", _joined), ("parts", _parts))
+        for count in (2, 4)
     }
     if len(cores) > 1:
         ways |= {"1 on a core": (1, _parts, cores), "2 parts on a core each": (2, _parts, cores)}
@@ -196,13 +234,23 @@ def processes(repetitions: int) -> list[Row]:
     found = []
     for name in ways:
         short, wall, processor = np.median([turn[name] for turn in turns], axis=0).tolist()
-        found += [Row(f"processes: {name}, speed", wall, "seeds/s"),
-                  Row(f"processes: {name}, speed by processor time", processor, "seeds/s"),
-                  Row(f"processes: {name}, whole command with start", short, "s")]  # fmt: skip
+        found += [
+            Row(f"processes: {name}, speed", wall, "seeds/s"),
+            Row(f"processes: {name}, speed by processor time", processor, "seeds/s"),
+            Row(f"processes: {name}, whole command with start", short, "s"),
+        ]
         if name not in ("1", "1 on a core"):
             base = "1 on a core" if "core" in name else "1"
             ratio = float(np.median([turn[name].wall / turn[base].wall for turn in turns]))
-            found.append(Row(f"processes: speed of {name}", ratio, "times", base, 1.7 if "core" in name else None))
+            found.append(
+                Row(
+                    f"processes: speed of {name}",
+                    ratio,
+                    "times",
+                    base,
+                    1.7 if "core" in name else None,
+                )
+            )
     return found
 
 
@@ -211,7 +259,10 @@ def _joined(count: int) -> list[list[str]]:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-    return [["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--process-id", str(i)] for i in range(count)]
+    return [
+        ["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--process-id", str(i)]
+        for i in range(count)
+    ]
 
 
 def _parts(count: int) -> list[list[str]]:
@@ -221,7 +272,9 @@ def _parts(count: int) -> list[list[str]]:
 
 def _pace(count: int, arguments: Callable[[int], list[list[str]]], cores: list[int] | None) -> Pace:
     few, many = 32_768, 425_984
-    (short, busy), (long, busier) = (_command(arguments(count), cores, seeds) for seeds in (few, many))
+    (short, busy), (long, busier) = (
+        _command(arguments(count), cores, seeds) for seeds in (few, many)
+    )
     return Pace(short, (many - few) / (long - short), (many - few) / (busier - busy))
 
 
@@ -229,8 +282,22 @@ def _command(each: list[list[str]], cores: list[int] | None, seeds: int) -> tupl
     """Wall and processor time [s] of the command, as so many processes at once."""
     with tempfile.TemporaryDirectory() as folder:
         store = f"{folder}/a.zarr"
-        command = [sys.executable, "-m", "jaxmuscle", "ensemble", "zagrodny-slifkin", "--seeds", str(seeds), "--reduce",
-                   "--duration", "1", "--threads", "1", "--out", store]  # fmt: skip
+        command = [
+            sys.executable,
+            "-m",
+            "jaxmuscle",
+            "ensemble",
+            "zagrodny-slifkin",
+            "--seeds",
+            str(seeds),
+            "--reduce",
+            "--duration",
+            "1",
+            "--threads",
+            "1",
+            "--out",
+            store,
+        ]
         quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         begun, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
         workers = []
@@ -239,7 +306,11 @@ def _command(each: list[list[str]], cores: list[int] | None, seeds: int) -> tupl
             workers.append(subprocess.Popen([*bound, *command, *more], **quiet))
         codes = [worker.wait() for worker in workers]
         if each[0][:1] == ["--part"]:
-            codes.append(subprocess.run([sys.executable, "-m", "jaxmuscle", "merge", store], **quiet).returncode)
+            codes.append(
+                subprocess.run(
+                    [sys.executable, "-m", "jaxmuscle", "merge", store], **quiet
+                ).returncode
+            )
         if any(codes):
             raise Unequal(f"processes: {' '.join(each[0])} failed")
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -252,7 +323,8 @@ import sys, threading, time, jax, jaxmuscle as jm
 from jaxmuscle.ensembles._speed import peak_memory
 jm.ensemble, jm.WhiteNoise
 before = peak_memory()
-found = jm.ensemble(jm.PrescribedForce(noise=jm.WhiteNoise()), jax.random.key(0), seeds=int(sys.argv[1]), duration=1.0,
+task = jm.PrescribedForce(noise=jm.WhiteNoise())
+found = jm.ensemble(task, jax.random.key(0), seeds=int(sys.argv[1]), duration=1.0,
                     control=False, reduce=True, threads=2)
 assert found.success
 print((peak_memory() - before) / 2**20)
@@ -264,15 +336,30 @@ def memory() -> list[Row]:
     found, values = [], []
     for seeds in (100_000, 1_000_000):
         begun = time.perf_counter()
-        done = subprocess.run([sys.executable, "-c", MEMORY, str(seeds)], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", MEMORY, str(seeds)], capture_output=True, text=True, check=True
+        )
         values.append(float(done.stdout))
         name = f"memory: {seeds} seeds of 1 s, reduced"
-        found += [Row(name, values[-1], "MiB", target=307, at_most=True), Row(name, time.perf_counter() - begun, "s")]
-    return [*found, Row("memory: 1 000 000 seeds over 100 000", values[1] / values[0], "times", target=1.1, at_most=True)]
+        found += [
+            Row(name, values[-1], "MiB", target=307, at_most=True),
+            Row(name, time.perf_counter() - begun, "s"),
+        ]
+    return [
+        *found,
+        Row(
+            "memory: 1 000 000 seeds over 100 000",
+            values[1] / values[0],
+            "times",
+            target=1.1,
+            at_most=True,
+        ),
+    ]
 
 
 def precision() -> list[Row]:
-    """What single precision does to spectra on the same noise: the largest error of a bin, of 64 seeds and of one."""
+    """What single precision does to spectra on the same noise: the largest error of a bin, of 64
+    seeds and of one."""
     found = []
     for task in (jm.Isometric(), jm.PrescribedForce()):
         powers = []
@@ -283,8 +370,10 @@ def precision() -> list[Row]:
         error = np.abs(powers[0] / powers[1] - 1).max()
         mean = np.abs(powers[0].mean(axis=0) / powers[1].mean(axis=0) - 1).max()
         name = f"precision: {type(task).__name__}, power in float32 against float64"
-        found += [Row(f"{name}, mean of 64 seeds", float(mean), "largest relative error of a bin"),
-                  Row(f"{name}, single seeds", float(error), "largest relative error of a bin")]  # fmt: skip
+        found += [
+            Row(f"{name}, mean of 64 seeds", float(mean), "largest relative error of a bin"),
+            Row(f"{name}, single seeds", float(error), "largest relative error of a bin"),
+        ]
     return found
 
 
@@ -293,4 +382,11 @@ def rows(repetitions: int) -> list[Row]:
     with jax.enable_x64(False):
         found = against("scale, white", jm.WhiteNoise(), white_by_hand, repetitions)
         found += against("scale, band-limited", jm.BandLimitedNoise(), band_by_hand, repetitions)
-        return found + reduced(repetitions) + threads(repetitions) + processes(repetitions) + memory() + precision()
+        return (
+            found
+            + reduced(repetitions)
+            + threads(repetitions)
+            + processes(repetitions)
+            + memory()
+            + precision()
+        )

@@ -1,7 +1,9 @@
-"""The picture of the layers, from the imports in the code: `python docs/architecture.py` writes docs/architecture.svg.
+"""The picture of the layers, from the imports in the code: `python docs/architecture.py` writes
+docs/architecture.svg.
 
-A line from one wing down to another says that the upper one imports the lower one; it is left out where a longer way leads
-there, too. `_common` and `plot`, which all wings may use, stand at the bottom without lines.
+A line from one wing down to another says that the upper one imports the lower one; it is left out
+where a longer way leads there, too. `_common` and `plot`, which all wings may use, stand at the
+bottom without lines.
 """
 
 import ast
@@ -15,14 +17,23 @@ from wings import layers  # noqa: E402
 PACKAGE, PICTURE = ROOT / "src" / "jaxmuscle", Path(__file__).with_name("architecture.svg")
 UNDRAWN = ("plot", "_common")
 HOLDS = {
-    "commands": "the command line", "paper": "the paper reproduced", "uncertainty": "profile, posterior, what is known",
-    "checks": "goodness of fit, bootstrap", "comparison": "which colour of noise", "fits": "one target, several, cohorts",
-    "objective": "residuals, likelihood, descent", "ensembles": "many seeds, stores, sweeps",
+    "commands": "the command line",
+    "paper": "the paper reproduced",
+    "uncertainty": "profile, posterior, what is known",
+    "checks": "goodness of fit, bootstrap",
+    "comparison": "which colour of noise",
+    "fits": "one target, several, cohorts",
+    "objective": "residuals, likelihood, descent",
+    "ensembles": "many seeds, stores, sweeps",
     "explorer": "a page with sliders",
-    "simulation": "solutions of the SDE", "response": "equilibrium, linear response", "data": "targets and recordings",
-    "model": "muscle, noises, tasks", "spectra": "Welch, its law, measures", "plot": "all figures",
+    "simulation": "solutions of the SDE",
+    "response": "equilibrium, linear response",
+    "data": "targets and recordings",
+    "model": "muscle, noises, tasks",
+    "spectra": "Welch, its law, measures",
+    "plot": "all figures",
     "_common": "errors, files, text, progress",
-}  # fmt: skip
+}
 WIDTH, HEIGHT, GAP, ROW, MARGIN, ROUND = 190, 54, 26, 98, 24, 10  # pixels
 
 Place = tuple[float, float]
@@ -35,7 +46,10 @@ def imports() -> set[tuple[str, str]]:
     for wing in wings:
         for module in (PACKAGE / wing).glob("*.py"):
             for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "jaxmuscle":
+                if (
+                    isinstance(node, ast.ImportFrom)
+                    and (node.module or "").split(".")[0] == "jaxmuscle"
+                ):
                     names = [f"{node.module}.{alias.name}".split(".")[1] for alias in node.names]
                     found |= {(wing, name) for name in names if name in wings and name != wing}
     return found
@@ -62,7 +76,8 @@ def bent(*points: Place) -> str:
 
 
 def way(upper: Place, lower: Place, boxes: list[Place]) -> list[Place]:
-    """The points of a line that leads around the boxes between: straight to the next row, else down beside a column."""
+    """The points of a line that leads around the boxes between: straight to the next row, else down
+    beside a column."""
     (x1, y1), (x2, y2) = upper, lower
     a, b, right = x1 + WIDTH / 2, x2 + WIDTH / 2, x2 > x1
 
@@ -71,7 +86,9 @@ def way(upper: Place, lower: Place, boxes: list[Place]) -> list[Place]:
 
     def alone(x: float, row: float, end: float) -> bool:
         return not any(
-            y == row and min(x, end) < left + WIDTH / 2 < max(x, end) for left, y in boxes if left not in (x1, x2)
+            y == row and min(x, end) < left + WIDTH / 2 < max(x, end)
+            for left, y in boxes
+            if left not in (x1, x2)
         )
 
     side1, side2 = y1 + HEIGHT / 2, y2 + HEIGHT / 2
@@ -101,17 +118,27 @@ def picture() -> str:
     for upper, lower in nearest():
         lines.append(bent(*way(place[upper], place[lower], [*place.values()])))
     for wing, (x, y) in place.items():
-        boxes.append(f'<rect x="{x:.0f}" y="{y:.0f}" width="{WIDTH}" height="{HEIGHT}" rx="6"/>'
-                     f'<text x="{x + WIDTH / 2:.0f}" y="{y + 24:.0f}" class="name">{wing}</text>'
-                     f'<text x="{x + WIDTH / 2:.0f}" y="{y + 42:.0f}" class="holds">{HOLDS[wing]}</text>')  # fmt: skip
+        boxes.append(
+            f'<rect x="{x:.0f}" y="{y:.0f}" width="{WIDTH}" height="{HEIGHT}" rx="6"/>'
+            f'<text x="{x + WIDTH / 2:.0f}" y="{y + 24:.0f}" class="name">{wing}</text>'
+            f'<text x="{x + WIDTH / 2:.0f}" y="{y + 42:.0f}" class="holds">{HOLDS[wing]}</text>'
+        )
     high = MARGIN * 2 + (len(rows) - 1) * ROW + HEIGHT
     style = (
         "rect{fill:#e8f0f8;stroke:#0072b2;stroke-width:1.2}path{fill:none;stroke:#777;stroke-width:1.5}"
         "text{font-family:sans-serif;text-anchor:middle;fill:#222}.name{font-size:15px;font-weight:bold}.holds{font-size:11px}"
     )
-    parts = [f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" width="{wide}" height="{high}">',
-             f"<style>{style}</style>", '<rect width="100%" height="100%" style="fill:white;stroke:none"/>',
-             *lines, *boxes, "</svg>"]  # fmt: skip
+    parts = [
+        (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" width="{wide}"'
+            f' height="{high}">'
+        ),
+        f"<style>{style}</style>",
+        '<rect width="100%" height="100%" style="fill:white;stroke:none"/>',
+        *lines,
+        *boxes,
+        "</svg>",
+    ]
     return "\n".join(parts) + "\n"
 
 

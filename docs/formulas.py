@@ -1,7 +1,8 @@
-"""For mkdocs: formulas as pictures, without the network. GitHub typesets the same sources by itself.
+"""For mkdocs: formulas as pictures, without the network. GitHub typesets the same sources by
+itself.
 
-In a page a formula is a fenced block of `math`, in a notebook it stands between dollars. It keeps to what matplotlib can
-set. Lines of an aligned block become pictures one below the other.
+In a page a formula is a fenced block of `math`, in a notebook it stands between dollars. It keeps
+to what matplotlib can set. Lines of an aligned block become pictures one below the other.
 """
 
 import base64
@@ -23,7 +24,9 @@ def typeset(markdown: str) -> str:
 
 def typeset_prose(text: str) -> str:
     """The same of a notebook's cell, code left alone."""
-    return "".join(piece if piece.startswith("`") else MATH.sub(_formula, piece) for piece in CODE.split(text))
+    return "".join(
+        piece if piece.startswith("`") else MATH.sub(_formula, piece) for piece in CODE.split(text)
+    )
 
 
 def _block(found: re.Match[str]) -> str:
@@ -50,4 +53,7 @@ def picture(latex: str) -> str:
     paper = b"fill: #ffffff"
     data = base64.b64encode(image.getvalue().replace(paper, b"fill: none")).decode()
     alt = latex.replace('"', "&quot;").replace("<", "&lt;")
-    return f'<img class="math" alt="{alt}" src="data:image/svg+xml;base64,{data}" style="vertical-align: -{depth:.1f}pt">'
+    return (
+        f'<img class="math" alt="{alt}" src="data:image/svg+xml;base64,{data}"'
+        f' style="vertical-align: -{depth:.1f}pt">'
+    )

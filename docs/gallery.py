@@ -1,4 +1,5 @@
-"""Draws the gallery and writes its page: `python docs/gallery.py` (minutes), or only `python docs/gallery.py FILE ...`."""
+"""Draws the gallery and writes its page: `python docs/gallery.py` (minutes), or only `python
+docs/gallery.py FILE ...`."""
 
 import os
 import sys
@@ -23,7 +24,8 @@ PAPER = {
 
 
 class Shown(NamedTuple):
-    """A figure: its file, the expression that draws it (empty: the setup does), words, where to read more."""
+    """A figure: its file, the expression that draws it (empty: the setup does), words, where to
+    read more."""
 
     file: str
     code: str
@@ -127,94 +129,283 @@ for i, name in enumerate(people):
 study = jm.run_study(rows, rate=100.0, units="N m", window=(5.0, 25.0), rung=0)
 """
 SECTIONS = (
-    Section("A fit", FIT, (
-        Shown("fit.png", "result.plot()", "A fit: spectra, residuals, output", "tutorial.md#4-read-it"),
-        Shown("gallery/schematic.png", "jm.plot.schematic(result)", "The model with its numbers", "model.md#muscle"),
-        Shown("gallery/components.png", "jm.plot.components(result)", "What the power is made of", "fitting.md"),
-        Shown("gallery/starts.png", "jm.plot.starts(result)", "Did all starts end at the same minimum?", "fitting.md"),
-        Shown("gallery/start_values.png", "jm.plot.start_values(result)", "In which parameters the starts agree",
-              "fitting.md"),
-        Shown("gallery/target.png", "target.plot(log=True)", "A target with the sampling error of its bins", "digitise.md"),
-    )),
-    Section("Simulations", SIMULATED, (
-        Shown("gallery/simulation.png", "jm.plot.simulation(runs)", "Output, its analysed window, spectra", "model.md"),
-        Shown("gallery/trajectory.png", "runs.plot(window=(10.0, 15.0))",
-              "200 seeds: their mean, their 90 % band, and three of them", "model.md"),
-        Shown("gallery/spectrum.png", "runs.spectrum().plot(log=True, proportional=False)",
-              "The spectra of these 200 seeds", "model.md"),
-        Shown("gallery/estimate.png", "runs.mean_spectrum().plot(log=True)",
-              "Mean spectrum of these seeds, with and without control variate",
-              "model.md"),
-        Shown("gallery/moments.png", "summary.plot()", "Mean and band of 2000 seeds that are not stored", "ensembles.md"),
-        Shown("gallery/sweep.png", "ax", "A sweep: three dampings with the same noise", "ensembles.md"),
-        Shown("gallery/sensitivity.png", "jm.sensitivity(result.task).plot()",
-              "How much each parameter changes each bin", "model.md"),
-        Shown("gallery/static.png", "jm.static_characteristics(result.task).plot()",
-              "Stiffness, damping and force against displacement and velocity", "scaling.md"),
-    )),
-    Section("How sure is it, and is it right?", SURE, (
-        Shown("gallery/profile.png", "corner.plot()", "A profile: how far one quantity can move", "uncertainty.md"),
-        Shown("gallery/profiles.png", 'jm.plot.profiles([corner, jm.profile(result, "high_frequency_floor")])',
-              "Several profiles", "uncertainty.md"),
-        Shown("gallery/posterior.png", "found.plot()", "The posterior of what the data determine", "uncertainty.md"),
-        Shown("gallery/chains.png", "found.plot_chains()", "The chains of the posterior", "uncertainty.md"),
-        Shown("gallery/predictive.png", "found.plot_predictive()", "The spectra that the posterior predicts",
-              "uncertainty.md"),
-        Shown("identifiability.png", "jm.identifiability(result).plot()", "What further measurements would determine",
-              "identifiability.md"),
-        Shown("gallery/designed_input.png", "jm.design_input(result).plot()", "A motion made to measure stiffness",
-              "perturbed-design.md"),
-        Shown("gallery/goodness.png", "jm.goodness(result).plot()",
-              "Is the model right? Residuals against what is usual", "goodness.md"),
-        Shown("gallery/bootstrap.png", "refits.plot()",
-              "Are the stated errors right? Refits of simulated data", "goodness.md"),
-        Shown("gallery/coverage.png", "refits.plot_coverage()",
-              "Do intervals of every level hold the truth as often as they say?", "uncertainty.md#the-coverage-curve"),
-        Shown("gallery/comparison.png", "jm.compare_noise(jm.Isometric(), target).plot()",
-              "Which noise? Models compared", "noise-colour.md"),
-    )),
-    Section("Recordings, people, several measurements", PEOPLE, (
-        Shown("gallery/recording.png", "recording.steady().plot()", "A recording and its steady window", "recordings.md"),
-        Shown("gallery/trials.png", "jm.Trials(trials).plot()", "Five trials and their mean spectrum",
-              "recordings.md#several-trials-of-one-person"),
-        Shown("gallery/steadiness.png", "jm.steadiness(trials).plot()", "How steady five trials are",
-              "recordings.md#steadiness"),
-        Shown("gallery/cohort.png", "cohort.plot()", "What six people's spectra determine", "fitting.md#many-targets"),
-        Shown("gallery/groups.png", "jm.plot.groups(cohort)", "Spectra and numbers of these six people",
-              "fitting.md#many-targets"),
-        Shown("gallery/levels.png", 'cohort.plot(by="level")',
-              "The same six people by level of contraction", "fitting.md#many-targets"),
-        Shown("gallery/joint.png", "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",
-              "Two measurements fitted together", "identifiability.md#a-joint-fit"),
-    )),
-    Section("A moved insertion", MOVED, (
-        Shown("gallery/perturbed.png", "perturbed.plot()", "Force and displacement, and the stiffness between them",
-              "perturbed.md"),
-        Shown("gallery/fitted_stiffness.png", "jm.fit(jm.PrescribedLength(), minute).plot()",
-              "A muscle fitted to a minute with a moved insertion: its stiffness and its fluctuations",
-              "perturbed.md#fit-it"),
-        Shown("gallery/frequency_response.png", "perturbed.frequency_response().plot()",
-              "The dynamic stiffness with its errors",
-              "perturbed.md"),
-    )),
-    Section("A study", STUDY, (
-        Shown("gallery/study.png", "study.plot()", "A study: spectra of people and of groups", "study.md"),
-    )),
-    Section("The paper's figures", '\njm.reproduce("paper")\n', tuple(
-        Shown(f"gallery/paper-{name}.png", "", words, "reproduce.md") for name, words in PAPER.items()
-    )),
-)  # fmt: skip
+    Section(
+        "A fit",
+        FIT,
+        (
+            Shown(
+                "fit.png",
+                "result.plot()",
+                "A fit: spectra, residuals, output",
+                "tutorial.md#4-read-it",
+            ),
+            Shown(
+                "gallery/schematic.png",
+                "jm.plot.schematic(result)",
+                "The model with its numbers",
+                "model.md#muscle",
+            ),
+            Shown(
+                "gallery/components.png",
+                "jm.plot.components(result)",
+                "What the power is made of",
+                "fitting.md",
+            ),
+            Shown(
+                "gallery/starts.png",
+                "jm.plot.starts(result)",
+                "Did all starts end at the same minimum?",
+                "fitting.md",
+            ),
+            Shown(
+                "gallery/start_values.png",
+                "jm.plot.start_values(result)",
+                "In which parameters the starts agree",
+                "fitting.md",
+            ),
+            Shown(
+                "gallery/target.png",
+                "target.plot(log=True)",
+                "A target with the sampling error of its bins",
+                "digitise.md",
+            ),
+        ),
+    ),
+    Section(
+        "Simulations",
+        SIMULATED,
+        (
+            Shown(
+                "gallery/simulation.png",
+                "jm.plot.simulation(runs)",
+                "Output, its analysed window, spectra",
+                "model.md",
+            ),
+            Shown(
+                "gallery/trajectory.png",
+                "runs.plot(window=(10.0, 15.0))",
+                "200 seeds: their mean, their 90 % band, and three of them",
+                "model.md",
+            ),
+            Shown(
+                "gallery/spectrum.png",
+                "runs.spectrum().plot(log=True, proportional=False)",
+                "The spectra of these 200 seeds",
+                "model.md",
+            ),
+            Shown(
+                "gallery/estimate.png",
+                "runs.mean_spectrum().plot(log=True)",
+                "Mean spectrum of these seeds, with and without control variate",
+                "model.md",
+            ),
+            Shown(
+                "gallery/moments.png",
+                "summary.plot()",
+                "Mean and band of 2000 seeds that are not stored",
+                "ensembles.md",
+            ),
+            Shown(
+                "gallery/sweep.png",
+                "ax",
+                "A sweep: three dampings with the same noise",
+                "ensembles.md",
+            ),
+            Shown(
+                "gallery/sensitivity.png",
+                "jm.sensitivity(result.task).plot()",
+                "How much each parameter changes each bin",
+                "model.md",
+            ),
+            Shown(
+                "gallery/static.png",
+                "jm.static_characteristics(result.task).plot()",
+                "Stiffness, damping and force against displacement and velocity",
+                "scaling.md",
+            ),
+        ),
+    ),
+    Section(
+        "How sure is it, and is it right?",
+        SURE,
+        (
+            Shown(
+                "gallery/profile.png",
+                "corner.plot()",
+                "A profile: how far one quantity can move",
+                "uncertainty.md",
+            ),
+            Shown(
+                "gallery/profiles.png",
+                'jm.plot.profiles([corner, jm.profile(result, "high_frequency_floor")])',
+                "Several profiles",
+                "uncertainty.md",
+            ),
+            Shown(
+                "gallery/posterior.png",
+                "found.plot()",
+                "The posterior of what the data determine",
+                "uncertainty.md",
+            ),
+            Shown(
+                "gallery/chains.png",
+                "found.plot_chains()",
+                "The chains of the posterior",
+                "uncertainty.md",
+            ),
+            Shown(
+                "gallery/predictive.png",
+                "found.plot_predictive()",
+                "The spectra that the posterior predicts",
+                "uncertainty.md",
+            ),
+            Shown(
+                "identifiability.png",
+                "jm.identifiability(result).plot()",
+                "What further measurements would determine",
+                "identifiability.md",
+            ),
+            Shown(
+                "gallery/designed_input.png",
+                "jm.design_input(result).plot()",
+                "A motion made to measure stiffness",
+                "perturbed-design.md",
+            ),
+            Shown(
+                "gallery/goodness.png",
+                "jm.goodness(result).plot()",
+                "Is the model right? Residuals against what is usual",
+                "goodness.md",
+            ),
+            Shown(
+                "gallery/bootstrap.png",
+                "refits.plot()",
+                "Are the stated errors right? Refits of simulated data",
+                "goodness.md",
+            ),
+            Shown(
+                "gallery/coverage.png",
+                "refits.plot_coverage()",
+                "Do intervals of every level hold the truth as often as they say?",
+                "uncertainty.md#the-coverage-curve",
+            ),
+            Shown(
+                "gallery/comparison.png",
+                "jm.compare_noise(jm.Isometric(), target).plot()",
+                "Which noise? Models compared",
+                "noise-colour.md",
+            ),
+        ),
+    ),
+    Section(
+        "Recordings, people, several measurements",
+        PEOPLE,
+        (
+            Shown(
+                "gallery/recording.png",
+                "recording.steady().plot()",
+                "A recording and its steady window",
+                "recordings.md",
+            ),
+            Shown(
+                "gallery/trials.png",
+                "jm.Trials(trials).plot()",
+                "Five trials and their mean spectrum",
+                "recordings.md#several-trials-of-one-person",
+            ),
+            Shown(
+                "gallery/steadiness.png",
+                "jm.steadiness(trials).plot()",
+                "How steady five trials are",
+                "recordings.md#steadiness",
+            ),
+            Shown(
+                "gallery/cohort.png",
+                "cohort.plot()",
+                "What six people's spectra determine",
+                "fitting.md#many-targets",
+            ),
+            Shown(
+                "gallery/groups.png",
+                "jm.plot.groups(cohort)",
+                "Spectra and numbers of these six people",
+                "fitting.md#many-targets",
+            ),
+            Shown(
+                "gallery/levels.png",
+                'cohort.plot(by="level")',
+                "The same six people by level of contraction",
+                "fitting.md#many-targets",
+            ),
+            Shown(
+                "gallery/joint.png",
+                "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",
+                "Two measurements fitted together",
+                "identifiability.md#a-joint-fit",
+            ),
+        ),
+    ),
+    Section(
+        "A moved insertion",
+        MOVED,
+        (
+            Shown(
+                "gallery/perturbed.png",
+                "perturbed.plot()",
+                "Force and displacement, and the stiffness between them",
+                "perturbed.md",
+            ),
+            Shown(
+                "gallery/fitted_stiffness.png",
+                "jm.fit(jm.PrescribedLength(), minute).plot()",
+                "A muscle fitted to a minute with a moved insertion: its stiffness and its"
+                " fluctuations",
+                "perturbed.md#fit-it",
+            ),
+            Shown(
+                "gallery/frequency_response.png",
+                "perturbed.frequency_response().plot()",
+                "The dynamic stiffness with its errors",
+                "perturbed.md",
+            ),
+        ),
+    ),
+    Section(
+        "A study",
+        STUDY,
+        (
+            Shown(
+                "gallery/study.png",
+                "study.plot()",
+                "A study: spectra of people and of groups",
+                "study.md",
+            ),
+        ),
+    ),
+    Section(
+        "The paper's figures",
+        '\njm.reproduce("paper")\n',
+        tuple(
+            Shown(f"gallery/paper-{name}.png", "", words, "reproduce.md")
+            for name, words in PAPER.items()
+        ),
+    ),
+)
 
 
 def page() -> str:
     """The text of the page."""
     parts = [HEAD]
     for section in SECTIONS:
-        parts.append(f'\n## {section.title}\n\n```python{section.setup}```\n\n<div class="gallery" markdown>\n')
+        parts.append(
+            f'\n## {section.title}\n\n```python{section.setup}```\n\n<div class="gallery"'
+            " markdown>\n"
+        )
         for shown in section.figures:
             code = f"`{shown.code}`" if shown.code else f"`{drawn(shown)}`"
             parts.append(f"\n<figure markdown>\n[![{shown.words}]({shown.file})]({shown.file})\n")
-            parts.append(f"<figcaption markdown>{code}<br>[{shown.words}]({shown.link})</figcaption>\n</figure>\n")
+            caption = f"{code}<br>[{shown.words}]({shown.link})"
+            parts.append(f"<figcaption markdown>{caption}</figcaption>\n</figure>\n")
         parts.append("\n</div>\n")
     return "".join(parts) + TAIL
 
@@ -236,11 +427,14 @@ def draw(shown: Shown, names: dict[str, Any], out: Path) -> None:
         made = made[0] if isinstance(made, tuple) else made
         getattr(made, "figure", made).savefig(path, dpi=DPI)
         plt.close("all")
-    few_colours(Image.open(path if shown.code else drawn(shown)).convert("RGB")).save(path, optimize=True)
+    few_colours(Image.open(path if shown.code else drawn(shown)).convert("RGB")).save(
+        path, optimize=True
+    )
 
 
 def few_colours(picture: Any) -> Any:
-    """The picture in its commonest colours: lines and areas keep theirs, the edges of letters get the nearest."""
+    """The picture in its commonest colours: lines and areas keep theirs, the edges of letters get
+    the nearest."""
     import numpy as np
     from PIL import Image
 

@@ -1,4 +1,5 @@
-"""Writes docs/reference/parameters.md and files.md from the tables in the code: `python docs/generate.py`."""
+"""Writes docs/reference/parameters.md and files.md from the tables in the code: `python
+docs/generate.py`."""
 
 import math
 import re
@@ -135,13 +136,36 @@ At its top a study.toml may have the keys of the second and the third table. Wha
 recording that does not say it itself."""
 F = _fit_file
 SECTIONS = (
-    ("fit.json", FIT_FILE, 2, (F.FitTable, F.PartTable, F.EstimateTable, F.AdequacyTable, F.RungTable, F.StartTable,
-                          F.CorrelationTable, F.ProfileTable, F.SettingsTable, F.SpectrumTable, F.StretchTable)),
+    (
+        "fit.json",
+        FIT_FILE,
+        2,
+        (
+            F.FitTable,
+            F.PartTable,
+            F.EstimateTable,
+            F.AdequacyTable,
+            F.RungTable,
+            F.StartTable,
+            F.CorrelationTable,
+            F.ProfileTable,
+            F.SettingsTable,
+            F.SpectrumTable,
+            F.StretchTable,
+        ),
+    ),
     ("Preset", PRESET, 1, (PresetFile,)),
     ("Target", TARGET, 1, (TargetFile, ResponseTable)),
     ("Study", STUDY, 1, (RecordingTable, ReadingTable, StudyFile)),
-)  # fmt: skip
-NAMES = {float: "number", int: "whole number", str: "text", bool: "true or false", dict: "table", type(None): "null"}
+)
+NAMES = {
+    float: "number",
+    int: "whole number",
+    str: "text",
+    bool: "true or false",
+    dict: "table",
+    type(None): "null",
+}
 LATER = {
     ("StartTable", "values"): 4,
     ("SettingsTable", "increments"): 4,
@@ -175,7 +199,10 @@ def page() -> str:
     for row in PARAMETERS.values():
         name = f"`{row.name}`" + (" ●" if row.name in DEFAULT_FREE else "")
         bounds = interval(row.lower, row.upper)
-        values.append(f"| {name} | {row.symbol} | {unit(row)} | {number(row.default)} | {bounds} | {row.meaning} |\n")
+        values.append(
+            f"| {name} | {row.symbol} | {unit(row)} | {number(row.default)} | {bounds} |"
+            f" {row.meaning} |\n"
+        )
         reached = interval(row.fit_lower, row.fit_upper)
         log = "yes" if row.positive else "no"
         source = row.source.replace("^2", "²")
@@ -188,21 +215,34 @@ def kind(given: typing.Any) -> str:
     origin, inside = typing.get_origin(given), typing.get_args(given)
     if origin is typing.Annotated:
         about = inside[1]
-        limits = ((about.gt, "above"), (about.ge, "at least"), (about.lt, "below"), (about.le, "at most"))
+        limits = (
+            (about.gt, "above"),
+            (about.ge, "at least"),
+            (about.lt, "below"),
+            (about.le, "at most"),
+        )
         said = [f"{word} {limit}" for limit, word in limits if limit is not None]
         return " ".join([kind(inside[0]), ", ".join(said)]).strip()
     if origin in (types.UnionType, typing.Union):
-        kinds = dict.fromkeys(kind(each) for each in inside if not (each is int and float in inside))
+        kinds = dict.fromkeys(
+            kind(each) for each in inside if not (each is int and float in inside)
+        )
         return " or ".join(bracketed(each, " of ") if len(kinds) > 1 else each for each in kinds)
     if origin is typing.Literal:
         return ", ".join(f"`{each}`" for each in inside)
     if origin in (list, tuple):
         each = bracketed(kind(inside[0]), " of ", " or ")
-        return f"list of {each}" if origin is list or ... in inside else f"list of {len(inside)}: {each}"
+        return (
+            f"list of {each}"
+            if origin is list or ... in inside
+            else f"list of {len(inside)}: {each}"
+        )
     if origin is dict:
         each = bracketed(kind(inside[1]), " of ", " or ")
         return f"table by name, each: {each}" if inside[1] is not typing.Any else "table"
-    return NAMES.get(given, "table" if isinstance(given, type) and issubclass(given, msgspec.Struct) else "any")
+    return NAMES.get(
+        given, "table" if isinstance(given, type) and issubclass(given, msgspec.Struct) else "any"
+    )
 
 
 def bracketed(text: str, *marks: str) -> str:
@@ -218,18 +258,26 @@ def files_page() -> str:
         for table in tables:
             hints = typing.get_type_hints(table, include_extras=True)
             text += f"\n### {(table.__doc__ or '').strip().rstrip('.')}\n\n"
-            text += "| key | meaning | type and range | if missing | since |\n|---|---|---|---|---|\n"
+            text += (
+                "| key | meaning | type and range | if missing | since |\n|---|---|---|---|---|\n"
+            )
             inherited = [name for base in table.__bases__ for name in base.__annotations__]
-            for field in (field for field in msgspec.structs.fields(table) if field.name not in inherited):
+            for field in (
+                field for field in msgspec.structs.fields(table) if field.name not in inherited
+            ):
                 given, *limits, about = typing.get_args(hints[field.name])
-                given = typing.Annotated[given, *limits] if limits else given  # an Annotated within one is flattened
+                # an Annotated within one is flattened
+                given = typing.Annotated[given, *limits] if limits else given
                 missing = about.extra["missing"] or "error"
                 if field.required != (missing == "error"):
-                    raise ValueError(f"{table.__name__}.{field.name}: say what it means that the key is missing")
+                    raise ValueError(
+                        f"{table.__name__}.{field.name}: say what it means that the key is missing"
+                    )
                 first = LATER.get((table.__name__, field.name), since)
                 told = about.extra["kind"] or kind(given)
                 if said == STUDY:
-                    told = re.sub(r"^\((.*)\)$", r"\1", told.removesuffix(" or null"))  # which neither TOML nor CSV has
+                    # which neither TOML nor CSV has
+                    told = re.sub(r"^\((.*)\)$", r"\1", told.removesuffix(" or null"))
                 text += f"| `{field.name}` | {about.description} | {told} | {missing} | {first} |\n"
     return text
 

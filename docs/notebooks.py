@@ -1,4 +1,5 @@
-"""For mkdocs: every notebook of ../notebooks, with its stored outputs, as a page; formulas of all pages typeset."""
+"""For mkdocs: every notebook of ../notebooks, with its stored outputs, as a page; formulas of all
+pages typeset."""
 
 import base64
 import json
@@ -14,7 +15,8 @@ sys.path.append(str(Path(__file__).parent))
 from formulas import typeset, typeset_prose
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
-NARROW, WIDE = 1000, "{ .wide }"  # pixels of a picture that a phone can show whole; how site.css knows others
+# pixels of a picture that a phone can show whole; how site.css knows others
+NARROW, WIDE = 1000, "{ .wide }"
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -29,8 +31,11 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Links to notebooks, which lead to files in the repository, lead to those pages; formulas are typeset."""
-    markdown = re.sub(r"\]\((?:\.\./)+notebooks/([\w-]+)\.ipynb\)", rf"]({_up(page)}notebooks/\1.md)", markdown)
+    """Links to notebooks, which lead to files in the repository, lead to those pages; formulas are
+    typeset."""
+    markdown = re.sub(
+        r"\]\((?:\.\./)+notebooks/([\w-]+)\.ipynb\)", rf"]({_up(page)}notebooks/\1.md)", markdown
+    )
     return typeset(markdown)
 
 
@@ -58,12 +63,14 @@ def page(notebook: dict[str, Any], stem: str) -> tuple[str, dict[str, bytes]]:
             elif "application/vnd.jupyter.widget-view+json" in data:
                 text = "*Here are sliders when the notebook runs.*"
             else:
-                text = "```text\n" + (text or "".join(data.get("text/plain", ""))).rstrip() + "\n```"
+                text = (
+                    "```text\n" + (text or "".join(data.get("text/plain", ""))).rstrip() + "\n```"
+                )
             parts.append(text)
     where = (
-        f'[Download this notebook]({stem}.ipynb){{ .md-button download="{stem}.ipynb" }}\n\n'
-        f"This is `notebooks/{stem}.ipynb` with its outputs. `make notebooks` opens all of them in JupyterLab, where you "
-        "can run and change them."
+        f'[Download this notebook]({stem}.ipynb){{ .md-button download="{stem}.ipynb" }}\n\nThis is'
+        f" `notebooks/{stem}.ipynb` with its outputs. `make notebooks` opens all of them in"
+        " JupyterLab, where you can run and change them."
     )
     title, *rest = parts[0].split("\n", 1)
     return "\n\n".join([title, where, *rest, *parts[1:]]) + "\n", pictures

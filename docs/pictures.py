@@ -1,6 +1,8 @@
-"""Draws the model for README, model.md and notebook 03: `python docs/pictures.py` writes docs/muscle.svg and docs/tasks.svg.
+"""Draws the model for README, model.md and notebook 03: `python docs/pictures.py` writes
+docs/muscle.svg and docs/tasks.svg.
 
-A picture holds the digest of what is drawn, not of how this version of matplotlib writes it. By that a stale one is found.
+A picture holds the digest of what is drawn, not of how this version of matplotlib writes it. By
+that a stale one is found.
 """
 
 import hashlib
@@ -35,7 +37,9 @@ def tasks() -> Figure:
     figure = plt.figure(figsize=(WIDE, 0.76 * WIDE))
     each = (jm.Isometric(), jm.PrescribedLength(), jm.PrescribedForce(), jm.PrescribedMotion())
     for i, task in enumerate(each):
-        jm.plot.schematic(task, figure.add_axes((0.5 * (i % 2), 0.5 * (i < 2), 0.49, 0.49)), values=False)
+        jm.plot.schematic(
+            task, figure.add_axes((0.5 * (i % 2), 0.5 * (i < 2), 0.49, 0.49)), values=False
+        )
     return figure
 
 
@@ -51,10 +55,26 @@ def _content(figure: Figure) -> Iterator[str]:
     for artist in figure.findobj(lambda one: isinstance(one, Text | Line2D | Rectangle)):
         drawn: Any = artist
         if isinstance(artist, Text):
-            shown = (artist.get_text(), artist.get_position(), getattr(artist, "xy", ()), artist.get_fontsize())
-            yield repr((shown[0], *(np.round(np.asarray(x, float), 6).tolist() for x in shown[1:]), artist.get_color()))
+            shown = (
+                artist.get_text(),
+                artist.get_position(),
+                getattr(artist, "xy", ()),
+                artist.get_fontsize(),
+            )
+            yield repr(
+                (
+                    shown[0],
+                    *(np.round(np.asarray(x, float), 6).tolist() for x in shown[1:]),
+                    artist.get_color(),
+                )
+            )
         elif isinstance(artist, Line2D):
-            yield repr((np.round(np.asarray(drawn.get_xydata(), float), 6).tolist(), str(drawn.get_color())))
+            yield repr(
+                (
+                    np.round(np.asarray(drawn.get_xydata(), float), 6).tolist(),
+                    str(drawn.get_color()),
+                )
+            )
         else:
             yield repr(np.round(np.asarray(drawn.get_bbox().bounds, float), 6).tolist())
 
@@ -66,14 +86,22 @@ def stored(name: str) -> str:
 
 
 def write(name: str) -> None:
-    """Stores a picture in twice its size, which a page makes smaller, its paths to a hundredth of a point."""
+    """Stores a picture in twice its size, which a page makes smaller, its paths to a hundredth of a
+    point."""
     with matplotlib.rc_context(SVG):
         figure, text = PICTURES[name](), io.StringIO()
         about = {"Date": None, "Description": f"drawn: {digest(figure)}"}
         figure.savefig(text, format="svg", facecolor="white", metadata=about)
     plt.close(figure)
-    shorter = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text.getvalue())
-    larger = re.sub(r'(width|height)="([\d.]+)pt"', lambda side: f'{side[1]}="{2 * float(side[2]):.0f}pt"', shorter, count=2)
+    shorter = re.sub(
+        r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text.getvalue()
+    )
+    larger = re.sub(
+        r'(width|height)="([\d.]+)pt"',
+        lambda side: f'{side[1]}="{2 * float(side[2]):.0f}pt"',
+        shorter,
+        count=2,
+    )
     (HERE / name).write_text(larger, encoding="utf-8")
 
 

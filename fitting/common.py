@@ -12,10 +12,15 @@ from jaxmuscle.plot import fit as figure
 
 
 def arguments(description: str, *, csv: bool, preset: bool = False) -> argparse.Namespace:
-    """Command line of a script; `csv` adds the user's own digitised spectrum, `preset` a file for the fitted task."""
+    """Command line of a script; `csv` adds the user's own digitised spectrum, `preset` a file for
+    the fitted task."""
     parser = argparse.ArgumentParser(description=description)
     if csv:
-        parser.add_argument("csv", nargs="?", help="your own digitised spectrum (two columns: Hz, proportional power)")
+        parser.add_argument(
+            "csv",
+            nargs="?",
+            help="your own digitised spectrum (two columns: Hz, proportional power)",
+        )
         parser.add_argument("--segments", type=int, help="Welch segments behind that spectrum")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=None, help="default: out/fitting/NAME")
@@ -27,7 +32,9 @@ def arguments(description: str, *, csv: bool, preset: bool = False) -> argparse.
 def load(name: str, options: argparse.Namespace) -> jm.Target:
     """The user's CSV if one was given, else the bundled target."""
     if getattr(options, "csv", None):
-        return jm.load_target(options.csv, quantity=jm.load_target(name).quantity, segments=options.segments)
+        return jm.load_target(
+            options.csv, quantity=jm.load_target(name).quantity, segments=options.segments
+        )
     return jm.load_target(name)
 
 

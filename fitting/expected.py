@@ -1,6 +1,8 @@
-"""Write expected/NAME.json for every target: medians over noise seeds, and tolerances from their spread.
+"""Write expected/NAME.json for every target: medians over noise seeds, and tolerances from their
+spread.
 
-And from those of [30] the parameters that `jaxmuscle reproduce` carries over the levels of contraction.
+And from those of [30] the parameters that `jaxmuscle reproduce` carries over the levels of
+contraction.
 """
 
 import importlib
@@ -24,7 +26,10 @@ SCRIPTS = {
 FOLDER = Path(__file__).parent / "expected"
 LEVELS = Path(__file__).parents[1] / "src" / "jaxmuscle" / "paper" / "levels.toml"
 SEEDS = (1, 2, 3, 4, 5)
-WHY = "3 times the largest deviation among fresh seeds 1 to 5, at least 2 % of the median (see fitting/README.md)"
+WHY = (
+    "3 times the largest deviation among fresh seeds 1 to 5, at least 2 % of the median (see"
+    " fitting/README.md)"
+)
 
 
 def values(result: jm.fits.FitResult) -> dict[str, float]:
@@ -51,12 +56,18 @@ def expected(name: str) -> dict:
 
 
 def levels() -> str:
-    """The parameters fitted to [30] at 35 and 95 % MVC, for `jaxmuscle reproduce`, which has no fitting/ beside it."""
+    """The parameters fitted to [30] at 35 and 95 % MVC, for `jaxmuscle reproduce`, which has no
+    fitting/ beside it."""
     found = {}
     for level in ("35", "95"):
-        table = json.loads((FOLDER / f"slifkin-newell-1999-{level}mvc.json").read_text(encoding="utf-8"))["values"]
+        table = json.loads(
+            (FOLDER / f"slifkin-newell-1999-{level}mvc.json").read_text(encoding="utf-8")
+        )["values"]
         found[level] = {name: row["value"] for name, row in table.items() if name in jm.PARAMETERS}
-    return "# Written by fitting/expected.py from fitting/expected/slifkin-newell-1999-*.json.\n\n" + tomli_w.dumps(found)
+    return (
+        "# Written by fitting/expected.py from fitting/expected/slifkin-newell-1999-*.json.\n\n"
+        + tomli_w.dumps(found)
+    )
 
 
 if __name__ == "__main__":
@@ -65,6 +76,8 @@ if __name__ == "__main__":
     keep_compiled_programs()
     FOLDER.mkdir(exist_ok=True)
     for name in sys.argv[1:] or SCRIPTS:
-        (FOLDER / f"{name}.json").write_text(json.dumps(expected(name), indent=1) + "\n", encoding="utf-8")
+        (FOLDER / f"{name}.json").write_text(
+            json.dumps(expected(name), indent=1) + "\n", encoding="utf-8"
+        )
         print(f"written: expected/{name}.json", flush=True)
     LEVELS.write_text(levels(), encoding="utf-8")

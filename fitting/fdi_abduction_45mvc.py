@@ -1,4 +1,5 @@
-"""Index-finger abduction force at 45 % MVC, measured: mean of two people, 4 Welch segments in all."""
+"""Index-finger abduction force at 45 % MVC, measured: mean of two people, 4 Welch segments in
+all."""
 
 import jaxmuscle as jm
 from common import arguments, load, report

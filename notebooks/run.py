@@ -1,4 +1,5 @@
-"""Runs the notebooks (all, or those named) and stores their outputs, pictures in few colours: `python notebooks/run.py`."""
+"""Runs the notebooks (all, or those named) and stores their outputs, pictures in few colours:
+`python notebooks/run.py`."""
 
 import base64
 import io
@@ -22,15 +23,18 @@ from gallery import few_colours  # noqa: E402
 def small(picture: str) -> str:
     """A PNG in base64, in its commonest colours."""
     found = io.BytesIO()
-    few_colours(Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGB")).save(found, "PNG", optimize=True)
+    few_colours(Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGB")).save(
+        found, "PNG", optimize=True
+    )
     return base64.b64encode(found.getvalue()).decode() + "\n"
 
 
 class Client(NotebookClient):
     """Runs cells with widgets without waiting for replies that are there.
 
-    nbclient answers an output widget on the socket on which it waits for a cell's reply. ZeroMQ tells only once that
-    something came, and sending uses that up: the reply was noticed after the cell's whole timeout, in every second cell.
+    nbclient answers an output widget on the socket on which it waits for a cell's reply. ZeroMQ
+    tells only once that something came, and sending uses that up: the reply was noticed after the
+    cell's whole timeout, in every second cell.
     """
 
     def process_message(self, msg: Any, cell: nbformat.NotebookNode, cell_index: int) -> Any:
@@ -45,7 +49,9 @@ def run(path: Path) -> None:
     """Execute a notebook in an empty folder and write it back when it is done."""
     notebook = nbformat.read(path, as_version=4)
     with tempfile.TemporaryDirectory() as folder:
-        Client(notebook, timeout=900, kernel_name="python3", resources={"metadata": {"path": folder}}).execute()
+        Client(
+            notebook, timeout=900, kernel_name="python3", resources={"metadata": {"path": folder}}
+        ).execute()
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)
         for output in cell.get("outputs", []):

@@ -1,4 +1,5 @@
-"""Programs that a test compiles itself: made as the package's own, where they draw; kept for the next run."""
+"""Programs that a test compiles itself: made as the package's own, where they draw; kept for the
+next run."""
 
 import functools
 import hashlib
@@ -25,25 +26,31 @@ _calls: Counter[tuple[str, str, int]] = Counter()
 
 
 def drawing(function: Callable[..., Any]) -> Any:
-    """As `kept_jit`, but optimised as the package's own programs that draw: normals have single precision, and are
-    rounded alike. Where the compiler does not know the option (conftest.py has tried it), they all are compiled alike.
+    """As `kept_jit`, but optimised as the package's own programs that draw: normals have single
+    precision, and are rounded alike. Where the compiler does not know the option (conftest.py has
+    tried it), they all are compiled alike.
     """
     return kept_jit(function, level=1)
 
 
 def at_once(function: Callable[..., Any], *given: Any) -> Any:
-    """`jax.jit(function)(*given)`, of arrays; the next run of the tests loads the program, and neither traces nor lowers it.
+    """`jax.jit(function)(*given)`, of arrays; the next run of the tests loads the program, and
+    neither traces nor lowers it.
 
-    It is found by the test, the line that calls this (and how often the test has called it there), and a digest of all files
-    that a test can be made of. If one of these files has changed, the program is made anew. It returns arrays, or tuples,
-    lists and dictionaries of them: the tree of another class does not survive in a file.
+    It is found by the test, the line that calls this (and how often the test has called it there),
+    and a digest of all files that a test can be made of. If one of these files has changed, the
+    program is made anew. It returns arrays, or tuples, lists and dictionaries of them: the tree of
+    another class does not survive in a file.
     """
     return kept_jit(function)(*given)
 
 
 def kept_jit(function: Callable[..., Any], *, level: int = 0, **options: Any) -> Callable[..., Any]:
-    """`jax.jit(function)`, its programs found as those of `at_once`; with options, or traced by JAX, just that."""
-    asked = {OPTIMISATION: level} if level and OPTIMISATION in os.environ.get("XLA_FLAGS", "") else None
+    """`jax.jit(function)`, its programs found as those of `at_once`; with options, or traced by
+    JAX, just that."""
+    asked = (
+        {OPTIMISATION: level} if level and OPTIMISATION in os.environ.get("XLA_FLAGS", "") else None
+    )
     whole = jax.jit(function, compiler_options=asked, **options)
     place = os.environ["PYTEST_CURRENT_TEST"], *_line()
     _calls[place] += 1
@@ -80,7 +87,12 @@ def _line() -> tuple[str, int]:
 
 
 def _program(
-    function: Any, leaves: list[Any], structure: Any, folder: Path, level: int, name: tuple[Any, ...]
+    function: Any,
+    leaves: list[Any],
+    structure: Any,
+    folder: Path,
+    level: int,
+    name: tuple[Any, ...],
 ) -> tuple[Any, Any]:
     """A program of arrays, and the tree of what it returns."""
     from jaxmuscle._common import programs
@@ -94,7 +106,9 @@ def _program(
 
     key = repr((name, level, programs._machine(), os.environ.get("XLA_FLAGS")))
     place = folder / _code()[:16] / hashlib.sha256(key.encode()).hexdigest()
-    if (entry := programs._read(place)) is not None and (compiled := programs._load(folder / entry[0])) is not None:
+    if (entry := programs._read(place)) is not None and (
+        compiled := programs._load(folder / entry[0])
+    ) is not None:
         return compiled, entry[1]
     flat.__name__ = "kept_in_test"
     lowered = jax.jit(flat, keep_unused=True).lower(*leaves)
@@ -102,8 +116,8 @@ def _program(
 
 
 def keep_own_classes() -> None:
-    """The package keeps no program of an own class, whose code may change without a sign. Of those in tests and pages all
-    code is known: their programs are found by the digest of all files.
+    """The package keeps no program of an own class, whose code may change without a sign. Of those
+    in tests and pages all code is known: their programs are found by the digest of all files.
     """
     from jaxmuscle._common import programs
 
@@ -124,21 +138,28 @@ def keep_own_classes() -> None:
 
 
 def _is_ours(kind: type) -> bool:
-    """Whether a class stands in a test or on a page; not within a function, which might make it otherwise each time."""
+    """Whether a class stands in a test or on a page; not within a function, which might make it
+    otherwise each time."""
     if "<locals>" in kind.__qualname__:
         return False
     file = getattr(sys.modules.get(kind.__module__), "__file__", None)
     places = [ROOT / "tests", ROOT / "docs"]
-    return kind.__module__.startswith(PAGE) or (file is not None and any(map(Path(file).is_relative_to, places)))
+    return kind.__module__.startswith(PAGE) or (
+        file is not None and any(map(Path(file).is_relative_to, places))
+    )
 
 
 @functools.cache
 def _code() -> str:
-    """Digest of what a test can be made of: the package with its data, tests, pages; and the versions of what they call."""
+    """Digest of what a test can be made of: the package with its data, tests, pages; and the
+    versions of what they call."""
     from jaxmuscle._common import programs
 
     digest = hashlib.sha256(repr(programs._versions()).encode())
-    files = [ROOT / "README.md", *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*"))]
+    files = [
+        ROOT / "README.md",
+        *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*")),
+    ]
     for path in sorted(path for path in files if path.is_file() and path.suffix not in UNREAD):
         digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()

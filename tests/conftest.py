@@ -1,4 +1,5 @@
-"""What holds for every test: shapes are checked, dtypes are never mixed silently, figures need no screen."""
+"""What holds for every test: shapes are checked, dtypes are never mixed silently, figures need no
+screen."""
 
 import contextlib
 import ctypes
@@ -30,16 +31,23 @@ os.environ["MPLBACKEND"] = "Agg"  # the environment reaches commands and noteboo
 
 from matplotlib.figure import Figure  # noqa: E402
 
-os.environ["NUMBA_DISABLE_JIT"] = "1"  # antropy, a reference: compiled it takes seven seconds more than it saves
+# antropy, a reference: compiled it takes seven seconds more than it saves
+os.environ["NUMBA_DISABLE_JIT"] = "1"
 
-# Compilation takes far longer than a deadline, and the outcome of a run should not depend on a draw.
+# Compilation takes far longer than a deadline, and the outcome of a run should not depend on a
+# draw.
 hypothesis.settings.register_profile("jaxmuscle", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("jaxmuscle")
 
 OUT = Path(__file__).parents[1] / ".test-out"
 
-# Of the C library, for workers and commands: memory comes and goes in large pieces. Page by page it takes a twentieth more.
-os.environ |= {"MALLOC_TOP_PAD_": f"{2**26}", "MALLOC_TRIM_THRESHOLD_": f"{2**30}", "MALLOC_MMAP_THRESHOLD_": f"{2**25}"}
+# Of the C library, for workers and commands: memory comes and goes in large pieces. Page by page it
+# takes a twentieth more.
+os.environ |= {
+    "MALLOC_TOP_PAD_": f"{2**26}",
+    "MALLOC_TRIM_THRESHOLD_": f"{2**30}",
+    "MALLOC_MMAP_THRESHOLD_": f"{2**25}",
+}
 # Programs are made without the lines of Python that they come from, which nobody reads.
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
 with contextlib.suppress(AttributeError):  # of a JAX that has no such option
@@ -49,7 +57,8 @@ with contextlib.suppress(AttributeError):  # of a JAX that has no such option
 def _keep_compiled_programs(folder: Path) -> None:
     """Make repeated runs fast; without a writable folder they are only slower.
 
-    All programs are kept, also the thousands of single operations: the second worker and the next run compile none again.
+    All programs are kept, also the thousands of single operations: the second worker and the next
+    run compile none again.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -62,27 +71,31 @@ def _keep_compiled_programs(folder: Path) -> None:
 
 
 QUICK_COMPILER = (
-    f"--{OPTIMISATION}=1 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
-    "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling,xla_cpu_disable_slp_vectorizer "
-    "--xla_disable_hlo_passes=simplification"
+    f"--{OPTIMISATION}=1 --xla_cpu_use_fusion_emitters=false"
+    " --xla_cpu_parallel_codegen_split_count=1"
+    " --xla_backend_extra_options=xla_cpu_disable_loop_unrolling,xla_cpu_disable_slp_vectorizer"
+    " --xla_disable_hlo_passes=simplification"
 )
 
 
 def _compile_quickly(known: Path) -> None:
-    """XLA's older emitters, LLVM at its first level, loops as they are, no rounds of simplification before it: compiled in
-    less than half the time, run as fast, the same numbers to rounding; and each program in one piece, since a worker has
-    one core.
+    """XLA's older emitters, LLVM at its first level, loops as they are, no rounds of simplification
+    before it: compiled in less than half the time, run as fast, the same numbers to rounding; and
+    each program in one piece, since a worker has one core.
 
-    An XLA that no longer has them ends the process at the flag: tried once for every version, in a process of its own. One
-    that ends for another reason is tried again the next time.
+    An XLA that no longer has them ends the process at the flag: tried once for every version, in a
+    process of its own. One that ends for another reason is tried again the next time.
     """
     if os.environ.get("XLA_FLAGS"):
         return
     asked = f"{jaxlib.__version__} {QUICK_COMPILER}"
     answer = known.read_text(encoding="utf-8") if known.exists() else ""
     if not answer.startswith(asked):
-        tried = subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], capture_output=True,
-                               env=os.environ | {"XLA_FLAGS": QUICK_COMPILER})  # fmt: skip
+        tried = subprocess.run(
+            [sys.executable, "-c", "import jax; jax.devices()"],
+            capture_output=True,
+            env=os.environ | {"XLA_FLAGS": QUICK_COMPILER},
+        )
         answer = f"{asked} {'understood' if tried.returncode == 0 else 'unknown'}"
         if tried.returncode == 0 or b"XLA_FLAGS" in tried.stderr:
             known.parent.mkdir(parents=True, exist_ok=True)
@@ -91,15 +104,33 @@ def _compile_quickly(known: Path) -> None:
         os.environ["XLA_FLAGS"] = QUICK_COMPILER
 
 
-# Kept programs that are computed often, or draw: where random numbers are rounded must not depend on who draws them. All
-# others, and what a test compiles itself, are computed a few times: without optimisation they compile in half the time.
-OPTIMISED = {"_of_rows", "_moments_and_slopes", "_step", "_start", "run_seeds", "run_points", "_driven", "filtered_power",
-             "_lowpass", "decimated", "_normal", "_cells", "_key", "_folded", "_wrapped", "_frequencies",
-             "_values"}  # fmt: skip
+# Kept programs that are computed often, or draw: where random numbers are rounded must not depend
+# on who draws them. All others, and what a test compiles itself, are computed a few times: without
+# optimisation they compile in half the time.
+OPTIMISED = {
+    "_of_rows",
+    "_moments_and_slopes",
+    "_step",
+    "_start",
+    "run_seeds",
+    "run_points",
+    "_driven",
+    "filtered_power",
+    "_lowpass",
+    "decimated",
+    "_normal",
+    "_cells",
+    "_key",
+    "_folded",
+    "_wrapped",
+    "_frequencies",
+    "_values",
+}
 
 
 class _AsCommands(dict):
-    """Options with which a program is made here as a command makes it that has `QUICK_COMPILER`: each loads the other's."""
+    """Options with which a program is made here as a command makes it that has `QUICK_COMPILER`:
+    each loads the other's."""
 
     def __init__(self, options: Any) -> None:
         super().__init__(options, **{OPTIMISATION: 1})
@@ -115,7 +146,9 @@ def _optimise_only_what_runs_often() -> None:
     def kept(function: Any) -> Any:
         options = programs.OPTIONS
         often = function.__name__ in OPTIMISED
-        return programs.Kept(function, _AsCommands(options) if often else options | {OPTIMISATION: 0})
+        return programs.Kept(
+            function, _AsCommands(options) if often else options | {OPTIMISATION: 0}
+        )
 
     programs.kept = kept
     programs.kept_to_run_long = lambda function: programs.Kept(function, _AsCommands({}))
@@ -127,8 +160,9 @@ _drawn: Counter[tuple] = Counter()
 
 
 def _draw_coarsely() -> None:
-    """PNGs: at 300 dots per inch, as journals want them, each takes half a second more. Where axes of the same names were
-    drawn before, placing and drawing them again takes another half: such a picture stays white, of the same size.
+    """PNGs: at 300 dots per inch, as journals want them, each takes half a second more. Where axes
+    of the same names were drawn before, placing and drawing them again takes another half: such a
+    picture stays white, of the same size.
     """
     figures.DPI = 75
     Figure.savefig = _saved  # pyright: ignore[reportAttributeAccessIssue]
@@ -139,7 +173,9 @@ def _saved(figure: Figure, place: Any, *args: Any, **options: Any) -> None:
     if kind != "png":
         return SAVED(figure, place, *args, **options)
     axes = figure.get_axes()
-    names = tuple((ax.get_title("left"), ax.get_title(), ax.get_xlabel(), ax.get_ylabel()) for ax in axes)
+    names = tuple(
+        (ax.get_title("left"), ax.get_title(), ax.get_xlabel(), ax.get_ylabel()) for ax in axes
+    )
     _drawn[names] += 1
     if _drawn[names] <= DRAWN_WHOLE:
         return SAVED(figure, place, *args, **options)
@@ -155,7 +191,8 @@ def as_fine_as_shipped(monkeypatch):
 
 # Of a process: what it forgets, which takes seconds, it traces and loads again.
 MOST_MAPS, MOST_MEMORY, SHARE = 45_000, 8 * 2**30, 0.34
-# Tracing makes objects by the million, few of them in circles: looking for these at Python's own pace takes a tenth of it.
+# Tracing makes objects by the million, few of them in circles: looking for these at Python's own
+# pace takes a tenth of it.
 gc.set_threshold(50_000, 20, 10)
 
 _keep_compiled_programs(OUT / "jax-cache")
@@ -172,7 +209,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _keep_to_own_cores(worker: dict[str, Any]) -> None:
-    """One of several workers keeps off the others' cores: threads of XLA that wait for one another cost a fifth more.
+    """One of several workers keeps off the others' cores: threads of XLA that wait for one another
+    cost a fifth more.
 
     So do those of NumPy's linear algebra, which counted the cores before.
     """
@@ -185,7 +223,8 @@ def _keep_to_own_cores(worker: dict[str, Any]) -> None:
 
 
 def _begin_without_optimisation() -> None:
-    """XLA reads its flags once. Commands that a test starts read theirs later: they have `QUICK_COMPILER` as it is."""
+    """XLA reads its flags once. Commands that a test starts read theirs later: they have
+    `QUICK_COMPILER` as it is."""
     flags = os.environ.get("XLA_FLAGS")
     if flags == QUICK_COMPILER:
         os.environ["XLA_FLAGS"] = flags.replace(f"{OPTIMISATION}=1", f"{OPTIMISATION}=0")
@@ -205,8 +244,9 @@ def pytest_collection_finish() -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     shapes.begin_anew()
-    # A command that ran here before keeps only what took long to compile (single operations would be compiled ever again),
-    # and `jaxmuscle speed` keeps nothing (all later tests would compile their own).
+    # A command that ran here before keeps only what took long to compile (single operations would
+    # be compiled ever again), and `jaxmuscle speed` keeps nothing (all later tests would compile
+    # their own).
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     os.environ.pop("JAXMUSCLE_CACHE", None)
     if item.get_closest_marker("gpu") and jax.default_backend() != "gpu":
@@ -215,14 +255,16 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _close_figures():
-    """Those that a file leaves open count for the next one, and the twenty-first is an error there."""
+    """Those that a file leaves open count for the next one, and the twenty-first is an error
+    there."""
     yield
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
 
 
 def _is_full() -> bool:
-    """Whether this process has too many compiled programs: by their memory maps, or by the memory of the process."""
+    """Whether this process has too many compiled programs: by their memory maps, or by the memory
+    of the process."""
     maps, pages = Path("/proc/self/maps"), Path("/proc/self/statm")
     if not maps.exists():
         return True
@@ -233,8 +275,9 @@ def _is_full() -> bool:
 
 @pytest.fixture(scope="module", autouse=True)
 def _forget_compiled_programs():
-    """Every compiled program takes memory maps, of which Linux allows a process 65530: thousands of tests use them up. And
-    programs of one piece take few maps, but as much memory: 9 GiB in the end if all were kept."""
+    """Every compiled program takes memory maps, of which Linux allows a process 65530: thousands of
+    tests use them up. And programs of one piece take few maps, but as much memory: 9 GiB in the end
+    if all were kept."""
     yield
     if _is_full():
         from jaxmuscle._common.programs import forget
@@ -242,7 +285,8 @@ def _forget_compiled_programs():
         forget()
         jax.clear_caches()
         gc.collect()
-        # What was freed stays with the process, which then would be full for ever: give it back to the system.
+        # What was freed stays with the process, which then would be full for ever: give it back to
+        # the system.
         with contextlib.suppress(OSError, AttributeError):  # where the C library is another
             ctypes.CDLL(None).malloc_trim(0)
 

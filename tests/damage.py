@@ -1,9 +1,11 @@
-"""Files that were damaged or changed by hand: read cleanly, or refused with one sentence that names the file.
+"""Files that were damaged or changed by hand: read cleanly, or refused with one sentence that names
+the file.
 
-    python tests/damage.py --count 5000          # of every format; prints how many were read and how many refused
+    python tests/damage.py --count 5000   # of every format; prints how many were read
 
-A mutant is a valid file with one change: in its text (bytes, lines, numbers) or in its structure (a key dropped, renamed or
-there twice, another value, type or nesting). What is read must be what the file says, by a reader of its own here.
+A mutant is a valid file with one change: in its text (bytes, lines, numbers) or in its structure (a
+key dropped, renamed or there twice, another value, type or nesting). What is read must be what the
+file says, by a reader of its own here.
 """
 
 import argparse
@@ -33,10 +35,39 @@ from jaxmuscle.fits._result import to_table
 from jaxmuscle.model._task_tables import task_to_table
 
 VALUES: tuple[Any, ...] = (
-    0, 1, -1, 2, 3.5, 1e-320, 1e308, -1e308, float("nan"), float("inf"), 10**30, 2**32, True, False, None, "", "x", "1",
-    "none", "inf", "../../x", "\x00", "\n", "\u00e9\U0001f600", [], [1], [None], ["x"], [[1.0]], {}, {"a": 1},
+    0,
+    1,
+    -1,
+    2,
+    3.5,
+    1e-320,
+    1e308,
+    -1e308,
+    float("nan"),
+    float("inf"),
+    10**30,
+    2**32,
+    True,
+    False,
+    None,
+    "",
+    "x",
+    "1",
+    "none",
+    "inf",
+    "../../x",
+    "\x00",
+    "\n",
+    "\u00e9\U0001f600",
+    [],
+    [1],
+    [None],
+    ["x"],
+    [[1.0]],
+    {},
+    {"a": 1},
     {"type": "Muscle"},
-)  # fmt: skip
+)
 WORDS = (
     "nan",
     "inf",
@@ -60,7 +91,8 @@ DEEP = 5000
 
 
 class Format(NamedTuple):
-    """A kind of file: a valid one, how it is read, the errors that may come, and whether what was read is what it says."""
+    """A kind of file: a valid one, how it is read, the errors that may come, and whether what was
+    read is what it says."""
 
     name: str
     text: str
@@ -78,7 +110,11 @@ def _close(a: Any, b: Any) -> bool:
         return a.keys() == b.keys() and all(_close(a[key], b[key]) for key in a)
     if isinstance(a, list | tuple) and isinstance(b, list | tuple):
         return len(a) == len(b) and all(map(_close, a, b))
-    if isinstance(a, bool) or isinstance(b, bool) or not (isinstance(a, int | float) and isinstance(b, int | float)):
+    if (
+        isinstance(a, bool)
+        or isinstance(b, bool)
+        or not (isinstance(a, int | float) and isinstance(b, int | float))
+    ):
         return type(a) is type(b) and a == b
     return bool(np.isclose(a, b, rtol=1e-8, atol=0))
 
@@ -86,12 +122,16 @@ def _close(a: Any, b: Any) -> bool:
 def _same_fit(result: jm.fits.FitResult, text: str) -> bool:
     made, said = json.loads(json.dumps(to_table(result))), json.loads(text)
     ignored = ("format", "verdict")
-    return _close({k: v for k, v in made.items() if k not in ignored}, {k: v for k, v in said.items() if k not in ignored})
+    return _close(
+        {k: v for k, v in made.items() if k not in ignored},
+        {k: v for k, v in said.items() if k not in ignored},
+    )
 
 
 def _same_preset(task: Any, text: str) -> bool:
     said = tomllib.loads(text)["task_table"]
-    if not isinstance(said["noise"]["amplitude"], list):  # one number is that of all four coefficients
+    # one number is that of all four coefficients
+    if not isinstance(said["noise"]["amplitude"], list):
         said["noise"]["amplitude"] = 4 * [said["noise"]["amplitude"]]
     return _close(json.loads(json.dumps(task_to_table(task))), said)
 
@@ -116,7 +156,9 @@ def _same_target(target: jm.Target, text: str) -> bool:
     if np.any(np.abs(position - bins) > 0.02) or len(set(bins)) < len(bins):
         return any("interpolated" in notice for notice in target.notices)
     kept = (bins >= target.settings.first_bin) & (bins <= target.settings.last_bin)
-    ratio = target.proportional_power / power[kept] if np.sum(kept) == len(target.bins) else np.zeros(2)
+    ratio = (
+        target.proportional_power / power[kept] if np.sum(kept) == len(target.bins) else np.zeros(2)
+    )
     return bool(np.ptp(ratio) <= 1e-8 * abs(ratio[0]) and ratio[0] > 0)
 
 
@@ -173,21 +215,40 @@ def _same_recording(recording: jm.Recording, text: str) -> bool:
     except (ValueError, IndexError):
         return True
     made = np.asarray(recording.samples)
-    return made.shape != force.shape or bool(np.allclose(made, force, rtol=1e-9, equal_nan=True)) or bool(recording.notices)
+    return (
+        made.shape != force.shape
+        or bool(np.allclose(made, force, rtol=1e-9, equal_nan=True))
+        or bool(recording.notices)
+    )
 
 
 # --- valid files
 
 PROJECT = {
     "version": [4, 2],
-    "axesColl": [{"name": "XY", "type": "XYAxes", "isLogX": False, "isLogY": False, "noRotation": False,
-                  "calibrationPoints": [{"px": 0.0, "py": 400.0, "dx": "0", "dy": "0"},
-                                        {"px": 600.0, "py": 400.0, "dx": "12", "dy": "0"},
-                                        {"px": 0.0, "py": 400.0, "dx": "0", "dy": "0"},
-                                        {"px": 0.0, "py": 0.0, "dx": "0", "dy": "1"}]}],
-    "datasetColl": [{"name": "A", "axesName": "XY",
-                     "data": [{"x": 19.53 * k, "y": 400 - 390 / (1 + k / 3)} for k in range(1, 31)]}],
-}  # fmt: skip
+    "axesColl": [
+        {
+            "name": "XY",
+            "type": "XYAxes",
+            "isLogX": False,
+            "isLogY": False,
+            "noRotation": False,
+            "calibrationPoints": [
+                {"px": 0.0, "py": 400.0, "dx": "0", "dy": "0"},
+                {"px": 600.0, "py": 400.0, "dx": "12", "dy": "0"},
+                {"px": 0.0, "py": 400.0, "dx": "0", "dy": "0"},
+                {"px": 0.0, "py": 0.0, "dx": "0", "dy": "1"},
+            ],
+        }
+    ],
+    "datasetColl": [
+        {
+            "name": "A",
+            "axesName": "XY",
+            "data": [{"x": 19.53 * k, "y": 400 - 390 / (1 + k / 3)} for k in range(1, 31)],
+        }
+    ],
+}
 
 
 def formats(folder: Path, result: jm.fits.FitResult) -> list[Format]:
@@ -196,28 +257,72 @@ def formats(folder: Path, result: jm.fits.FitResult) -> list[Format]:
     power = 1 / (1 + (grid / 1.2) ** 2) + 0.01
     result.save(folder / "valid.json")
     jm.save_preset(folder / "valid.toml", result.task, description="a preset")
-    target = jm.Target("made", power, segments=[6, 7], coefficient_of_variation=[0.02, 0.03], mean=[2.0, 2.1], unit="N",
-                       sigma=0.1 * power, source="here", settings=jm.SpectrumSettings(filter_direction="both"))  # fmt: skip
+    target = jm.Target(
+        "made",
+        power,
+        segments=[6, 7],
+        coefficient_of_variation=[0.02, 0.03],
+        mean=[2.0, 2.1],
+        unit="N",
+        sigma=0.1 * power,
+        source="here",
+        settings=jm.SpectrumSettings(filter_direction="both"),
+    )
     target.save(folder / "target.toml")
     rng = np.random.default_rng(0)
     samples = 5 + 0.1 * rng.standard_normal(200)
-    recording = "# a trial\ntime_s,force_N\n" + "".join(f"{k / 100:.2f},{x:.6f}\n" for k, x in enumerate(samples))
-    people = [(person, group, trial) for person, group in (("anna", "a"), ("ben", "b"), ("eva", "a")) for trial in (1, 2)]
+    recording = "# a trial\ntime_s,force_N\n" + "".join(
+        f"{k / 100:.2f},{x:.6f}\n" for k, x in enumerate(samples)
+    )
+    people = [
+        (person, group, trial)
+        for person, group in (("anna", "a"), ("ben", "b"), ("eva", "a"))
+        for trial in (1, 2)
+    ]
     study = "file,person,group,condition,trial,rate\n"
     for person, group, trial in people:
         (folder / f"{person}{trial}.csv").write_text(recording)
         study += f"{person}{trial}.csv,{person},{group},rest,{trial},100\n"
-    listed = {"rung": 1, "alpha": 0.05, "recordings": [
-        {"file": f"{person}{trial}.csv", "person": person, "group": group, "trial": trial, "rate": 100.0}
-        for person, group, trial in people]}  # fmt: skip
+    listed = {
+        "rung": 1,
+        "alpha": 0.05,
+        "recordings": [
+            {
+                "file": f"{person}{trial}.csv",
+                "person": person,
+                "group": group,
+                "trial": trial,
+                "rate": 100.0,
+            }
+            for person, group, trial in people
+        ],
+    }
     spectrum = "# made\nfrequency_hz,proportional_power\n" + "".join(
         f"{f:.6f},{p:.6f}\n" for f, p in zip(grid, power, strict=True)
     )
     clean = lambda *_: True  # noqa: E731
     return [
-        Format("fit.json", (folder / "valid.json").read_text(), jm.load_result, (ResultError,), _same_fit),
-        Format("preset.toml", (folder / "valid.toml").read_text(), jm.load_preset, (PresetError,), _same_preset),
-        Format("target.toml", (folder / "target.toml").read_text(), jm.load_target, (TargetError,), _same_target),
+        Format(
+            "fit.json",
+            (folder / "valid.json").read_text(),
+            jm.load_result,
+            (ResultError,),
+            _same_fit,
+        ),
+        Format(
+            "preset.toml",
+            (folder / "valid.toml").read_text(),
+            jm.load_preset,
+            (PresetError,),
+            _same_preset,
+        ),
+        Format(
+            "target.toml",
+            (folder / "target.toml").read_text(),
+            jm.load_target,
+            (TargetError,),
+            _same_target,
+        ),
         Format("project.json", json.dumps(PROJECT), jm.load_target, (TargetError,), clean),
         Format("target.csv", spectrum, jm.load_target, (TargetError,), _same_csv),
         Format("study.csv", study, read_study, (ValueError,), _same_study),
@@ -230,7 +335,13 @@ def formats(folder: Path, result: jm.fits.FitResult) -> list[Format]:
 
 
 def _places(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    inside = value.items() if isinstance(value, dict) else enumerate(value[:40]) if isinstance(value, list) else ()
+    inside = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value[:40])
+        if isinstance(value, list)
+        else ()
+    )
     return [place for key, entry in inside for place in ((*at, key), *_places(entry, (*at, key)))]
 
 
@@ -241,7 +352,9 @@ def _changed(table: Any, rng: random.Random) -> tuple[Any, str | None]:
     for step in way:
         holder = holder[step]
     value = holder[last]
-    kind = rng.choice(("drop", "rename", "value", "value", "nest", "deep", "scale", "text", "twice"))
+    kind = rng.choice(
+        ("drop", "rename", "value", "value", "nest", "deep", "scale", "text", "twice")
+    )
     if kind == "drop":
         del holder[last]
     elif kind == "rename" and isinstance(holder, dict):
@@ -288,13 +401,21 @@ def _structured(text: str, kind: str, rng: random.Random) -> str | None:
     if kind == "json":
         text = json.dumps(table)
         return (
-            text if twice is None else text.replace(f'"{twice}":', f'"{twice}": {rng.choice(("1", "null"))}, "{twice}":', 1)
+            text
+            if twice is None
+            else text.replace(
+                f'"{twice}":', f'"{twice}": {rng.choice(("1", "null"))}, "{twice}":', 1
+            )
         )
     try:
         text = tomli_w.dumps(table)
     except (TypeError, ValueError, RecursionError):  # TOML has no word for it
         return None
-    return text if twice is None else re.sub(rf"(?m)^({re.escape(str(twice))} = .*)$", r"\1\n\1", text, count=1)
+    return (
+        text
+        if twice is None
+        else re.sub(rf"(?m)^({re.escape(str(twice))} = .*)$", r"\1\n\1", text, count=1)
+    )
 
 
 def _texted(text: str, rng: random.Random) -> bytes:
@@ -302,7 +423,19 @@ def _texted(text: str, rng: random.Random) -> bytes:
     data = text.encode()
     at = rng.randrange(len(data))
     kind = rng.choice(
-        ("flip", "flip", "insert", "delete", "cut", "line gone", "line twice", "swap", "number", "number", "deep")
+        (
+            "flip",
+            "flip",
+            "insert",
+            "delete",
+            "cut",
+            "line gone",
+            "line twice",
+            "swap",
+            "number",
+            "number",
+            "deep",
+        )
     )
     lines = text.split("\n")
     row = rng.randrange(len(lines))
@@ -310,7 +443,11 @@ def _texted(text: str, rng: random.Random) -> bytes:
     if kind == "flip":
         return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
     if kind == "insert":
-        return data[:at] + rng.choice((b"\x00", b"\xff", b",", b'"', b"\n", b"#", b"[", b"\xef\xbb\xbf", b"1")) + data[at:]
+        return (
+            data[:at]
+            + rng.choice((b"\x00", b"\xff", b",", b'"', b"\n", b"#", b"[", b"\xef\xbb\xbf", b"1"))
+            + data[at:]
+        )
     if kind == "delete":
         return data[:at] + data[at + rng.choice((1, 2, 30)) :]
     if kind == "cut":
@@ -341,7 +478,8 @@ def mutant(of: Format, rng: random.Random) -> bytes:
 
 
 def fault(of: Format, data: bytes, path: Path) -> str | None:
-    """What is wrong with how a mutant was met: "" if it was read, None if it was refused as it should be."""
+    """What is wrong with how a mutant was met: "" if it was read, None if it was refused as it
+    should be."""
     path.write_bytes(data)
     try:
         found = of.read(path)
@@ -352,10 +490,16 @@ def fault(of: Format, data: bytes, path: Path) -> str | None:
         if "\n" in said or not said.strip():
             return f"not one sentence: {said[:200]!r}"
         return None if path.name in said else f"names no file: {said[:200]}"
-    return "" if of.same(found, data.decode("utf-8-sig", errors="replace")) else "read as something else than it says"
+    return (
+        ""
+        if of.same(found, data.decode("utf-8-sig", errors="replace"))
+        else "read as something else than it says"
+    )
 
 
-def tried(of: Format, count: int, folder: Path, seed: int = 0) -> tuple[collections.Counter, list[tuple[str, bytes]]]:
+def tried(
+    of: Format, count: int, folder: Path, seed: int = 0
+) -> tuple[collections.Counter, list[tuple[str, bytes]]]:
     """How many mutants were read and refused, and those that were met wrongly."""
     rng, counts, wrong = random.Random(f"{of.name} {seed}"), collections.Counter(), []
     path = folder / f"mutant.{of.name.rpartition('.')[2]}"
@@ -385,9 +529,15 @@ def main() -> None:
             if given.format in (None, of.name):
                 start = time.process_time()
                 counts, wrong = tried(of, given.count, Path(name), given.seed)
-                print(f"{of.name:<14} {given.count} mutants: {counts['read']} read as they say, {counts['refused']} "
-                      f"refused, {counts['wrong']} wrong ({time.process_time() - start:.0f} s)", flush=True)  # fmt: skip
-                for found, count in collections.Counter(found[:110] for found, _ in wrong).most_common(12):
+                print(
+                    f"{of.name:<14} {given.count} mutants: {counts['read']} read as they say,"
+                    f" {counts['refused']} refused, {counts['wrong']} wrong"
+                    f" ({time.process_time() - start:.0f} s)",
+                    flush=True,
+                )
+                for found, count in collections.Counter(
+                    found[:110] for found, _ in wrong
+                ).most_common(12):
                     print(f"    {count} x {found}")
                 if given.keep is not None:
                     given.keep.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,9 @@
-"""Damaged files by the hundred: small good ones of every format, mutants of them, and a reader that outlives its crashes.
+"""Damaged files by the hundred: small good ones of every format, mutants of them, and a reader that
+outlives its crashes.
 
-A process for each file takes a quarter of a second, most of it Python's start. Here one process imports what is needed and
-forks for each file: the fork does what the process of `_apart` does, within the same limits.
+A process for each file takes a quarter of a second, most of it Python's start. Here one process
+imports what is needed and forks for each file: the fork does what the process of `_apart` does,
+within the same limits.
 """
 
 import io
@@ -39,7 +41,11 @@ WORDS = (
 
 def signals() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(5)
-    return {"force": 10 + rng.normal(size=ROWS), "Data": rng.normal(size=(ROWS, 3)), "fs": np.array(100.0)}
+    return {
+        "force": 10 + rng.normal(size=ROWS),
+        "Data": rng.normal(size=(ROWS, 3)),
+        "fs": np.array(100.0),
+    }
 
 
 def write_mat(path: Path) -> None:
@@ -90,7 +96,9 @@ def write_c3d(path: Path) -> None:
 def write_edf(path: Path) -> None:
     import edfio
 
-    force = edfio.EdfSignal(signals()["force"], 60, label="Force", physical_dimension="N", physical_range=(-20, 20))
+    force = edfio.EdfSignal(
+        signals()["force"], 60, label="Force", physical_dimension="N", physical_range=(-20, 20)
+    )
     edfio.Edf([force]).write(path)
 
 
@@ -98,21 +106,32 @@ def write_tdms(path: Path) -> None:
     import nptdms
 
     with nptdms.TdmsWriter(str(path)) as writer:
-        writer.write_segment([nptdms.ChannelObject("arm", "Force", signals()["force"], {"wf_increment": 0.01})])
+        writer.write_segment(
+            [nptdms.ChannelObject("arm", "Force", signals()["force"], {"wf_increment": 0.01})]
+        )
 
 
 def write_xlsx(path: Path) -> None:
     import pandas
 
-    pandas.DataFrame({"time": np.arange(ROWS) / 100, "force_N": signals()["force"]}).to_excel(path, index=False)
+    pandas.DataFrame({"time": np.arange(ROWS) / 100, "force_N": signals()["force"]}).to_excel(
+        path, index=False
+    )
 
 
 def write_tar(path: Path) -> None:
-    points = [{"px": 0, "py": 0, "dx": "0", "dy": "0"}, {"px": 9, "py": 0, "dx": "12", "dy": "0"},
-              {"px": 0, "py": 0, "dx": "0", "dy": "0"}, {"px": 0, "py": 9, "dx": "0", "dy": "1"}]  # fmt: skip
+    points = [
+        {"px": 0, "py": 0, "dx": "0", "dy": "0"},
+        {"px": 9, "py": 0, "dx": "12", "dy": "0"},
+        {"px": 0, "py": 0, "dx": "0", "dy": "0"},
+        {"px": 0, "py": 9, "dx": "0", "dy": "1"},
+    ]
     data = [{"x": x, "y": 9 - x / 2} for x in range(1, 9)]
-    project = {"version": [4, 2], "axesColl": [{"name": "XY", "type": "XYAxes", "calibrationPoints": points}],
-               "datasetColl": [{"name": "one", "axesName": "XY", "data": data}]}  # fmt: skip
+    project = {
+        "version": [4, 2],
+        "axesColl": [{"name": "XY", "type": "XYAxes", "calibrationPoints": points}],
+        "datasetColl": [{"name": "one", "axesName": "XY", "data": data}],
+    }
     text = json.dumps(project).encode()
     with tarfile.open(path, "w") as archive:
         entry = tarfile.TarInfo("figure/wpd.json")
@@ -121,13 +140,22 @@ def write_tar(path: Path) -> None:
 
 
 WRITERS: dict[str, Callable[[Path], None]] = {
-    "mat": write_mat, "packed.mat": write_packed_mat, "v73.mat": write_mat73, "npz": write_npz, "npy": write_npy,
-    "c3d": write_c3d, "edf": write_edf, "tdms": write_tdms, "xlsx": write_xlsx, "tar": write_tar,
-}  # fmt: skip
+    "mat": write_mat,
+    "packed.mat": write_packed_mat,
+    "v73.mat": write_mat73,
+    "npz": write_npz,
+    "npy": write_npy,
+    "c3d": write_c3d,
+    "edf": write_edf,
+    "tdms": write_tdms,
+    "xlsx": write_xlsx,
+    "tar": write_tar,
+}
 
 
 def mutant(data: bytes, rng: random.Random) -> bytes:
-    """The bytes with one to four faults: bits flipped, bytes replaced, numbers made extreme, pieces lost or doubled."""
+    """The bytes with one to four faults: bits flipped, bytes replaced, numbers made extreme, pieces
+    lost or doubled."""
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 4))):
         # Headers stand in front; a fault there does most.
@@ -151,12 +179,16 @@ def mutant(data: bytes, rng: random.Random) -> bytes:
 
 
 def serve(request: dict[str, Any]) -> None:
-    """In the process that forks: for each file a line of how it ended and how many bytes were said, and these."""
+    """In the process that forks: for each file a line of how it ended and how many bytes were said,
+    and these."""
     from jaxmuscle.data import _apart_child
 
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    _apart_child.answer({"kind": request["kind"], "path": request["good"], "most": request["most"]}, io.BytesIO())  # imports
+    # imports
+    _apart_child.answer(
+        {"kind": request["kind"], "path": request["good"], "most": request["most"]}, io.BytesIO()
+    )
     for path in request["files"]:
         end, start = os.pipe()
         child = os.fork()
@@ -164,7 +196,9 @@ def serve(request: dict[str, Any]) -> None:
             signal.alarm(2 * SECONDS)
             with os.fdopen(start, "wb") as stream:
                 _apart_child.limit(request["most"], SECONDS)
-                _apart_child.answer({"kind": request["kind"], "path": path, "most": request["most"]}, stream)
+                _apart_child.answer(
+                    {"kind": request["kind"], "path": path, "most": request["most"]}, stream
+                )
             os._exit(0)
         os.close(start)
         with os.fdopen(end, "rb") as stream:
@@ -174,12 +208,24 @@ def serve(request: dict[str, Any]) -> None:
     out.close()
 
 
-def answers(kind: str, good: Path, files: list[Path], most: int) -> Iterator[tuple[Path, int, bytes]]:
+def answers(
+    kind: str, good: Path, files: list[Path], most: int
+) -> Iterator[tuple[Path, int, bytes]]:
     """How the reading of each file ended, and what was handed over."""
-    request = {"paths": [str(Path(__file__).parent), *sys.path], "kind": kind, "good": str(good), "most": most,
-               "files": list(map(str, files))}  # fmt: skip
-    done = subprocess.run([sys.executable, "-c", SERVE], input=json.dumps(request).encode() + b"\n", stdout=subprocess.PIPE,
-                          stderr=subprocess.DEVNULL, check=True)  # fmt: skip
+    request = {
+        "paths": [str(Path(__file__).parent), *sys.path],
+        "kind": kind,
+        "good": str(good),
+        "most": most,
+        "files": list(map(str, files)),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", SERVE],
+        input=json.dumps(request).encode() + b"\n",
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        check=True,
+    )
     stream = io.BytesIO(done.stdout)
     for path in files:
         code, size = struct.unpack("<iq", stream.read(12))
@@ -195,11 +241,20 @@ def outcome(path: Path, kind: str, code: int, said: bytes) -> str:
     from jaxmuscle.data._recording_table import channels_table
 
     try:
-        found = understood(path, kind, io.BytesIO(said), lambda: _ended(code, SECONDS, late=code == -signal.SIGALRM))
+        found = understood(
+            path,
+            kind,
+            io.BytesIO(said),
+            lambda: _ended(code, SECONDS, late=code == -signal.SIGALRM),
+        )
         if kind == ".tar":
             read_project(found.decode("utf-8", errors="replace"), str(path), None)
             return ""
-        table = read_csv(found, str(path)) if isinstance(found, bytes) else channels_table(str(path), found)
+        table = (
+            read_csv(found, str(path))
+            if isinstance(found, bytes)
+            else channels_table(str(path), found)
+        )
         load_columns(table, units="N", **({"rate": 100} if kind == ".npy" else {}))
     except ValueError as error:
         return str(error)
@@ -214,17 +269,28 @@ TIME = np.arange(ROWS) / 500
 X, Y = np.round(signals()["force"], 3), np.round(signals()["Data"][:, 0], 3)
 _TEXTS = {
     "csv": "time,force_N\n" + _rows(TIME, X, sign=","),
-    "labchart": "Interval=\t0.002 s\nChannelTitle=\tForce\tEMG\nRange=\t100.000 N\t10.000 mV\nUnitName=\tN\t*\n"
-    + _rows(TIME, X, Y),
-    "spike2": '"INFORMATION"\n"trial.smr"\n\n"SUMMARY"\n"1"\t"Waveform"\t"Force"\t" N"\t500\t500.0\t1\t0\n\n"CHANNEL"\t"1"\n'
-    '"Waveform"\n"No comment"\n"Force"\n" N"\t500\n"START"\t0.00000\t0.00200\n' + _rows(X),
-    "acqknowledge": "trial.acq\n2 msec/sample\n2 channels\nForce\nN\nEMG\nmV\nCH1\tCH2\t\n60\t60\t\n"
-    + _rows(X, Y, [""] * ROWS),
-    "diadem": "#BEGINCHANNELHEADER\n200,Zeit\n202,s\n210,IMPLICIT\n240,0\n241,0.002\n#ENDCHANNELHEADER\n"
-    "#BEGINCHANNELHEADER\n200,Kraft\n202,N\n210,EXPLICIT\n#ENDCHANNELHEADER\n" + _rows(X),
-    "diadem beside": "#BEGINCHANNELHEADER\n200,Zeit\n202,s\n210,IMPLICIT\n240,0\n241,0.002\n#ENDCHANNELHEADER\n"
-    "#BEGINCHANNELHEADER\n200,Kraft\n202,N\n210,EXPLICIT\n211,values.bin\n213,CHANNEL\n214,REAL64\n220,120\n221,1\n"
-    "#ENDCHANNELHEADER\n",
+    "labchart": (
+        "Interval=\t0.002 s\nChannelTitle=\tForce\tEMG\nRange=\t100.000 N\t10.000"
+        " mV\nUnitName=\tN\t*\n" + _rows(TIME, X, Y)
+    ),
+    "spike2": (
+        '"INFORMATION"\n"trial.smr"\n\n"SUMMARY"\n"1"\t"Waveform"\t"Force"\t"'
+        ' N"\t500\t500.0\t1\t0\n\n"CHANNEL"\t"1"\n"Waveform"\n"No comment"\n"Force"\n"'
+        ' N"\t500\n"START"\t0.00000\t0.00200\n' + _rows(X)
+    ),
+    "acqknowledge": (
+        "trial.acq\n2 msec/sample\n2 channels\nForce\nN\nEMG\nmV\nCH1\tCH2\t\n60\t60\t\n"
+        + _rows(X, Y, [""] * ROWS)
+    ),
+    "diadem": (
+        "#BEGINCHANNELHEADER\n200,Zeit\n202,s\n210,IMPLICIT\n240,0\n241,0.002\n#ENDCHANNELHEADER\n"
+        "#BEGINCHANNELHEADER\n200,Kraft\n202,N\n210,EXPLICIT\n#ENDCHANNELHEADER\n" + _rows(X)
+    ),
+    "diadem beside": (
+        "#BEGINCHANNELHEADER\n200,Zeit\n202,s\n210,IMPLICIT\n240,0\n241,0.002\n#ENDCHANNELHEADER\n"
+        "#BEGINCHANNELHEADER\n200,Kraft\n202,N\n210,EXPLICIT\n211,values.bin\n213,CHANNEL\n214,REAL64\n220,120\n221,1\n"
+        "#ENDCHANNELHEADER\n"
+    ),
     "clock": "clock;F\n" + _rows([f"10:00:{t:06.3f}" for t in TIME], X, sign=";"),
 }
 TEXTS = {name: text.encode() for name, text in _TEXTS.items()}

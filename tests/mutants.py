@@ -1,12 +1,14 @@
-"""Does the suite notice a wrong number? Random small faults in the package, and which of them a test finds.
+"""Does the suite notice a wrong number? Random small faults in the package, and which of them a
+test finds.
 
-    python tests/mutants.py --count 10 --out out/mutants.json          # 10 mutants of every subject, hours
-    python tests/mutants.py --count 10 --tests ../older/tests ...      # the same mutants seen by other tests
+    python tests/mutants.py --count 10 --out out/mutants.json  # 10 mutants of every subject, hours
+    python tests/mutants.py --count 10 --tests ../older/tests ...  # the same, seen by other tests
 
-A mutant is a copy of the package with one operator, comparison, number or condition changed. It runs the test files of its
-subject in the order of `SUBJECTS`, the most direct first, and of these first what is not slow. It ends at the first failure
-or after `--seconds`. Other files might find it, too: the share that is killed is a lower bound. Mutants that were run stay
-in the file and are not run again.
+A mutant is a copy of the package with one operator, comparison, number or condition changed. It
+runs the test files of its subject in the order of `SUBJECTS`, the most direct first, and of these
+first what is not slow. It ends at the first failure or after `--seconds`. Other files might find
+it, too: the share that is killed is a lower bound. Mutants that were run stay in the file and are
+not run again.
 """
 
 import argparse
@@ -30,9 +32,18 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "jaxmuscle"
 SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "muscle": (("model/_muscle",), ("muscle", "task", "hill", "closed_forms", "simulate", "expected")),
-    "tasks": (("model/_tasks", "model/_signals"), ("task", "signal", "muscle", "closed_forms", "simulate", "expected")),
-    "noise": (("model/_noise", "model/_pink_noise"), ("noise", "pink", "closed_forms", "orders", "expected", "control")),
+    "muscle": (
+        ("model/_muscle",),
+        ("muscle", "task", "hill", "closed_forms", "simulate", "expected"),
+    ),
+    "tasks": (
+        ("model/_tasks", "model/_signals"),
+        ("task", "signal", "muscle", "closed_forms", "simulate", "expected"),
+    ),
+    "noise": (
+        ("model/_noise", "model/_pink_noise"),
+        ("noise", "pink", "closed_forms", "orders", "expected", "control"),
+    ),
     "path": (
         ("simulation/_integrator", "simulation/_batch", "simulation/_simulate"),
         ("simulate", "orders", "closed_forms", "gradients", "control", "ensemble"),
@@ -50,7 +61,13 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("expected", "sensitivity", "static", "scaling", "second_order", "control", "fit"),
     ),
     "spectra": (
-        ("spectra/_welch", "spectra/_settings", "spectra/_measures", "spectra/_neighbours", "spectra/_mean"),
+        (
+            "spectra/_welch",
+            "spectra/_settings",
+            "spectra/_measures",
+            "spectra/_neighbours",
+            "spectra/_mean",
+        ),
         ("spectrum", "metrics", "uncertainty", "control", "simulate"),
     ),
     "likelihood": (
@@ -79,7 +96,13 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("uncertainty", "checks", "fit", "identify", "joint", "fitting", "goodness"),
     ),
     "targets": (
-        ("data/_target", "data/_target_files", "data/_target_fields", "data/_target_csv", "data/_digitised"),
+        (
+            "data/_target",
+            "data/_target_files",
+            "data/_target_fields",
+            "data/_target_csv",
+            "data/_digitised",
+        ),
         ("target", "digitised", "trials", "cli", "moved"),
     ),
     "recordings": (
@@ -100,7 +123,15 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "data/_recording_time",
             "data/_units",
         ),
-        ("recording", "recording_file", "recording_formats", "hostile", "trials", "perturbed", "reproduce"),
+        (
+            "recording",
+            "recording_file",
+            "recording_formats",
+            "hostile",
+            "trials",
+            "perturbed",
+            "reproduce",
+        ),
     ),
     "ensemble store": (
         (
@@ -117,13 +148,42 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("ensemble", "job_array"),
     ),
 }
-ARITHMETIC = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult,
-              ast.FloorDiv: ast.Mult, ast.Mod: ast.FloorDiv}  # fmt: skip
-COMPARISONS = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
-               ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In}  # fmt: skip
-OPPOSITE = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "any": "all", "all": "any",
-            "sin": "cos", "cos": "sin", "real": "imag", "argmin": "argmax", "argmax": "argmin"}  # fmt: skip
-WORDS_AND_PICTURES = {"__str__", "__repr__", "plot", "message", "remarks", "notices"}  # what they say is tested, not counted
+ARITHMETIC = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.Pow: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.FloorDiv,
+}
+COMPARISONS = {
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+}
+OPPOSITE = {
+    "min": "max",
+    "max": "min",
+    "minimum": "maximum",
+    "maximum": "minimum",
+    "any": "all",
+    "all": "any",
+    "sin": "cos",
+    "cos": "sin",
+    "real": "imag",
+    "argmin": "argmax",
+    "argmax": "argmin",
+}
+# what they say is tested, not counted
+WORDS_AND_PICTURES = {"__str__", "__repr__", "plot", "message", "remarks", "notices"}
 
 
 NO_TESTS = 5  # pytest's exit code where none has the mark
@@ -164,15 +224,20 @@ def changed(node: ast.AST) -> Iterator[ast.AST]:
         case ast.Call(func=ast.Attribute(attr="where"), args=[test, one, other]):
             yield ast.Call(node.func, [test, other, one], node.keywords)
         case ast.Call(func=ast.Attribute(attr=name)) if name in OPPOSITE:
-            yield ast.Call(ast.Attribute(node.func.value, OPPOSITE[name], ast.Load()), node.args, node.keywords)
+            yield ast.Call(
+                ast.Attribute(node.func.value, OPPOSITE[name], ast.Load()), node.args, node.keywords
+            )
         case ast.Call(func=ast.Name(id=name)) if name in OPPOSITE:
             yield ast.Call(ast.Name(OPPOSITE[name], ast.Load()), node.args, node.keywords)
 
 
 def of_numbers(node: ast.AST) -> Iterator[ast.AST]:
-    """The node and all below it that numbers can depend on: no annotations, errors, texts, figures."""
+    """The node and all below it that numbers can depend on: no annotations, errors, texts,
+    figures."""
     skipped = (ast.Raise, ast.JoinedStr, ast.arg, ast.Import, ast.ImportFrom, ast.Assert)
-    if isinstance(node, skipped) or (isinstance(node, ast.FunctionDef) and node.name in WORDS_AND_PICTURES):
+    if isinstance(node, skipped) or (
+        isinstance(node, ast.FunctionDef) and node.name in WORDS_AND_PICTURES
+    ):
         return
     if isinstance(node, ast.If) and any(isinstance(inside, ast.Raise) for inside in node.body):
         yield from of_numbers(node.test)
@@ -190,7 +255,10 @@ def of_file(subject: str, path: Path) -> list[Mutant]:
     found = []
     for node in of_numbers(ast.parse(text)):
         for other in changed(node):
-            before, after = ast.get_source_segment(text, node), ast.unparse(ast.fix_missing_locations(other))
+            before, after = (
+                ast.get_source_segment(text, node),
+                ast.unparse(ast.fix_missing_locations(other)),
+            )
             if before and "\n" not in before:
                 found.append(
                     Mutant(
@@ -235,15 +303,35 @@ def judged(mutant: Mutant, folder: Path, seconds: float) -> dict[str, Any]:
     original = (SOURCE / f"{mutant.file}.py").read_text(encoding="utf-8")
     path.write_text(applied(mutant, original), encoding="utf-8")
     files = [
-        str(file) for test in SUBJECTS[mutant.subject][1] for file in sorted((folder / "tests").rglob(f"test_{test}.py"))
+        str(file)
+        for test in SUBJECTS[mutant.subject][1]
+        for file in sorted((folder / "tests").rglob(f"test_{test}.py"))
     ]
     begun, killer, ended = time.monotonic(), None, True
     try:
         for mark in ("not slow", "slow"):
-            command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-m", mark, *files]
-            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False,
-                                  timeout=max(1.0, seconds - (time.monotonic() - begun)),
-                                  env=os.environ | {"PYTHONPATH": str(folder / "src")})  # fmt: skip
+            command = [
+                sys.executable,
+                "-m",
+                "pytest",
+                "-x",
+                "-q",
+                "--tb=no",
+                "-p",
+                "no:cacheprovider",
+                "-m",
+                mark,
+                *files,
+            ]
+            done = subprocess.run(
+                command,
+                cwd=folder,
+                capture_output=True,
+                text=True,
+                check=False,
+                timeout=max(1.0, seconds - (time.monotonic() - begun)),
+                env=os.environ | {"PYTHONPATH": str(folder / "src")},
+            )
             failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
             if done.returncode not in (0, NO_TESTS):
                 killer = failed.group(1) if failed else f"exit {done.returncode}"
@@ -256,8 +344,11 @@ def judged(mutant: Mutant, folder: Path, seconds: float) -> dict[str, Any]:
 
 
 def copied(folder: Path, tests: Path) -> Path:
-    """The project in `folder` with those tests; compiled programs are shared with the project itself."""
-    kept = shutil.ignore_patterns(".git", ".venv", "out", "site", ".test-out", "__pycache__", "tests")
+    """The project in `folder` with those tests; compiled programs are shared with the project
+    itself."""
+    kept = shutil.ignore_patterns(
+        ".git", ".venv", "out", "site", ".test-out", "__pycache__", "tests"
+    )
     shutil.copytree(ROOT, folder, ignore=kept, symlinks=True)
     shutil.copytree(tests, folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
     (ROOT / ".test-out").mkdir(exist_ok=True)
@@ -272,19 +363,32 @@ def table(found: dict[str, Any]) -> str:
         count[row["subject"]] += 1
         killed[row["subject"]] += row["killed by"] is not None
     rows = [f"{subject:18}{count[subject]:5}{killed[subject]:5}" for subject in count]
-    total = f"{'all':18}{count.total():5}{killed.total():5}   {100 * killed.total() / max(count.total(), 1):.0f} %"
-    alive = [f"  survives: {row['subject']}: {name}" for name, row in found.items() if row["killed by"] is None]
+    total = (
+        f"{'all':18}{count.total():5}{killed.total():5}  "
+        f" {100 * killed.total() / max(count.total(), 1):.0f} %"
+    )
+    alive = [
+        f"  survives: {row['subject']}: {name}"
+        for name, row in found.items()
+        if row["killed by"] is None
+    ]
     return "\n".join([f"{'subject':18}{'mutants':>5}{'killed':>7}", *rows, total, *alive])
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=10, help="mutants of every subject")
     parser.add_argument("--seed", type=int, default=14)
     parser.add_argument("--tests", type=Path, default=ROOT / "tests")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "mutants.json")
-    parser.add_argument("--seconds", type=float, default=180.0, help="for one mutant; then it counts as not noticed")
-    parser.add_argument("--names", type=Path, help="a file with the names of mutants, one a line: run these")
+    parser.add_argument(
+        "--seconds", type=float, default=180.0, help="for one mutant; then it counts as not noticed"
+    )
+    parser.add_argument(
+        "--names", type=Path, help="a file with the names of mutants, one a line: run these"
+    )
     parser.add_argument("--only", default="", help="mutants whose name contains this")
     parser.add_argument("--list", action="store_true", help="show the mutants, run none")
     given = parser.parse_args()
@@ -298,7 +402,10 @@ def main() -> None:
         return
     found = json.loads(given.out.read_text(encoding="utf-8")) if given.out.exists() else {}
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as scratch, concurrent.futures.ThreadPoolExecutor(2) as workers:
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        concurrent.futures.ThreadPoolExecutor(2) as workers,
+    ):
         folders: queue.SimpleQueue[Path] = queue.SimpleQueue()
         for number in range(2):
             folders.put(copied(Path(scratch) / str(number), given.tests))
@@ -315,7 +422,10 @@ def main() -> None:
             mutant, row = done.result()
             found[mutant.name] = {"subject": mutant.subject} | row
             given.out.write_text(json.dumps(found, indent=1), encoding="utf-8")
-            print(f"{row['seconds']:6.0f} s  {mutant.name}  {row['killed by'] or 'SURVIVES'}", flush=True)
+            print(
+                f"{row['seconds']:6.0f} s  {mutant.name}  {row['killed by'] or 'SURVIVES'}",
+                flush=True,
+            )
     print(table(found))
 
 

@@ -16,7 +16,8 @@ from compiled import PAGE, kept_jit
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-IN_A_KERNEL = "03-three-tasks"  # the one with sliders, which test_notebooks.py runs as Jupyter does, too
+# the one with sliders, which test_notebooks.py runs as Jupyter does, too
+IN_A_KERNEL = "03-three-tasks"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -26,12 +27,17 @@ def name_of(page: Path) -> str:
 
 def blocks(page: Path) -> list[str]:
     """Its Python blocks in order, also those inside a list."""
-    found = re.findall(r"^( *)```python\n(.*?)^\1```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    found = re.findall(
+        r"^( *)```python\n(.*?)^\1```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
     return [textwrap.dedent(code) for _, code in found]
 
 
-def run(name: str, names: Mapping[str, Any] | None = None, smaller: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Runs the blocks of a page in order in one namespace, in which `names` are there before, and returns that.
+def run(
+    name: str, names: Mapping[str, Any] | None = None, smaller: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Runs the blocks of a page in order in one namespace, in which `names` are there before, and
+    returns that.
 
     `smaller` replaces texts, numbers that only make a block slow, each of which must be there.
     """
@@ -40,11 +46,15 @@ def run(name: str, names: Mapping[str, Any] | None = None, smaller: Mapping[str,
 
 def run_cells(path: Path, smaller: Mapping[str, str] | None = None) -> dict[str, Any]:
     """Runs the code cells of a notebook as `run` does the blocks of a page."""
-    cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    cells = [
+        cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"
+    ]
     return _executed(path.name, cells, {}, smaller or {})
 
 
-def _executed(name: str, blocks: list[str], namespace: dict[str, Any], smaller: Mapping[str, str]) -> dict[str, Any]:
+def _executed(
+    name: str, blocks: list[str], namespace: dict[str, Any], smaller: Mapping[str, str]
+) -> dict[str, Any]:
     for old, new in smaller.items():
         assert any(old in code for code in blocks), f"{name} says no longer {old}"
         blocks = [code.replace(old, new) for code in blocks]
@@ -74,19 +84,24 @@ def _content(value: Any) -> Any:
     """What a value holds, so that equal ones are equal and can be looked up."""
     leaves, structure = jax.tree.flatten(value)
     arrays = [jax.random.key_data(x) if _is_key(x) else x for x in leaves]
-    numbers = [(str(x.dtype), x.shape, np.asarray(x).tobytes()) if hasattr(x, "dtype") else repr(x) for x in arrays]
+    numbers = [
+        (str(x.dtype), x.shape, np.asarray(x).tobytes()) if hasattr(x, "dtype") else repr(x)
+        for x in arrays
+    ]
     return str(structure), tuple(numbers)
 
 
 class Once:
-    """Public functions that pages call with the same arguments again and again, run once each; `last` result by name."""
+    """Public functions that pages call with the same arguments again and again, run once each;
+    `last` result by name."""
 
     def __init__(self) -> None:
         self.last: dict[str, Any] = {}
         self.found: dict[Any, Any] = {}
 
     def of(self, name: str, function: Callable[..., Any], **fewer: Any) -> Callable[..., Any]:
-        """`function` with `fewer` options where a page does not name them; what is written to disk is always run."""
+        """`function` with `fewer` options where a page does not name them; what is written to disk
+        is always run."""
 
         @functools.wraps(function)
         def inside(*given: Any, **options: Any) -> Any:

@@ -1,12 +1,14 @@
-"""Processes that run a program or a command, without the seconds that importing JAX and the package takes each time.
+"""Processes that run a program or a command, without the seconds that importing JAX and the package
+takes each time.
 
-One process for all tests of a worker imports them once, and starts no device. Each process that a test asks for is a fork
-of it: with its own environment, folder and pipes it runs as `python -c PROGRAM` or `python -m jaxmuscle` would, and ends as
-they end. On other systems than Linux it is exactly these, and also where the imports start a thread, which a fork would not
-have.
+One process for all tests of a worker imports them once, and starts no device. Each process that a
+test asks for is a fork of it: with its own environment, folder and pipes it runs as `python -c
+PROGRAM` or `python -m jaxmuscle` would, and ends as they end. On other systems than Linux it is
+exactly these, and also where the imports start a thread, which a fork would not have.
 
-What the imports themselves do is tested with true processes: the installed package (test_package.py), the console script
-and the listings (test_cli.py), signals during imports (test_signals.py), processes that fail together (test_ensemble.py).
+What the imports themselves do is tested with true processes: the installed package
+(test_package.py), the console script and the listings (test_cli.py), signals during imports
+(test_signals.py), processes that fail together (test_ensemble.py).
 """
 
 import atexit
@@ -29,12 +31,26 @@ from typing import Any
 
 SRC = Path(__file__).parents[1] / "src"
 IMPORTED = (
-    "diffrax", "jax.experimental.multihost_utils", "jax.experimental.serialize_executable", "jax.scipy.linalg",
-    "jaxmuscle.commands.main", "jaxmuscle.simulation._integrator", "matplotlib.pyplot", "optimistix", "pydantic",
-    "pydantic.type_adapter", "pydantic.types", "rich.progress", "scipy.optimize", "scipy.signal", "scipy.stats", "xarray",
+    "diffrax",
+    "jax.experimental.multihost_utils",
+    "jax.experimental.serialize_executable",
+    "jax.scipy.linalg",
+    "jaxmuscle.commands.main",
+    "jaxmuscle.simulation._integrator",
+    "matplotlib.pyplot",
+    "optimistix",
+    "pydantic",
+    "pydantic.type_adapter",
+    "pydantic.types",
+    "rich.progress",
+    "scipy.optimize",
+    "scipy.signal",
+    "scipy.stats",
+    "xarray",
     "zarr",
-)  # fmt: skip
-LAZY = ("jaxmuscle", "jaxmuscle.ensembles", "jaxmuscle.fits", "jaxmuscle.simulation")  # with all their public names
+)
+# with all their public names
+LAZY = ("jaxmuscle", "jaxmuscle.ensembles", "jaxmuscle.fits", "jaxmuscle.simulation")
 LONGEST = 2**17  # bytes of a request
 FORKS = sys.platform == "linux"
 
@@ -44,8 +60,11 @@ def environment(**changes: str) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(SRC)} | changes
 
 
-def python(program: str, *arguments: str, cwd: Any = None, merged: bool = False, **changes: str) -> Any:
-    """`python -c program arguments`, begun, with changes of the environment; `merged`: its errors among its output."""
+def python(
+    program: str, *arguments: str, cwd: Any = None, merged: bool = False, **changes: str
+) -> Any:
+    """`python -c program arguments`, begun, with changes of the environment; `merged`: its errors
+    among its output."""
     return _begun(program, arguments, cwd, merged, changes)
 
 
@@ -54,7 +73,9 @@ def command(*arguments: str, cwd: Any = None, merged: bool = False, **changes: s
     return _begun(None, arguments, cwd, merged, changes)
 
 
-def true_python(program: str, *arguments: str, cwd: Any = None, merged: bool = False, **changes: str) -> Any:
+def true_python(
+    program: str, *arguments: str, cwd: Any = None, merged: bool = False, **changes: str
+) -> Any:
     """As `python`; no fork, but a process that imports what it needs itself."""
     return _true(program, arguments, cwd, merged, changes)
 
@@ -96,17 +117,33 @@ class Run:
             self.process.close()
 
 
-def _begun(program: str | None, arguments: tuple[str, ...], cwd: Any, merged: bool, changes: dict[str, str]) -> Any:
+def _begun(
+    program: str | None, arguments: tuple[str, ...], cwd: Any, merged: bool, changes: dict[str, str]
+) -> Any:
     if FORKS and (line := _server()) is not None:
-        request = {"program": program, "arguments": arguments, "cwd": str(cwd or Path.cwd()), "env": environment(**changes)}
+        request = {
+            "program": program,
+            "arguments": arguments,
+            "cwd": str(cwd or Path.cwd()),
+            "env": environment(**changes),
+        }
         return Process(line, request, merged)
     return _true(program, arguments, cwd, merged, changes)
 
 
-def _true(program: str | None, arguments: tuple[str, ...], cwd: Any, merged: bool, changes: dict[str, str]) -> Any:
+def _true(
+    program: str | None, arguments: tuple[str, ...], cwd: Any, merged: bool, changes: dict[str, str]
+) -> Any:
     begin = [sys.executable, *(("-m", "jaxmuscle") if program is None else ("-c", program))]
-    return subprocess.Popen([*begin, *arguments], cwd=cwd, env=environment(**changes), text=True, stdin=subprocess.DEVNULL,
-                            stdout=subprocess.PIPE, stderr=subprocess.STDOUT if merged else subprocess.PIPE)  # fmt: skip
+    return subprocess.Popen(
+        [*begin, *arguments],
+        cwd=cwd,
+        env=environment(**changes),
+        text=True,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT if merged else subprocess.PIPE,
+    )
 
 
 # Of the tests
@@ -118,11 +155,15 @@ class Process:
     def __init__(self, line: socket.socket, request: dict[str, Any], merged: bool) -> None:
         (said, out), (failed, errors), (told, tell) = pipes = [os.pipe() for _ in range(3)]
         try:
-            socket.send_fds(line, [json.dumps(request).encode()], [out, out if merged else errors, tell])
+            socket.send_fds(
+                line, [json.dumps(request).encode()], [out, out if merged else errors, tell]
+            )
         finally:
             for _, end in pipes:
                 os.close(end)
-        self.stdout, self.stderr, self._told = (open(pipe, encoding="utf-8") for pipe in (said, failed, told))  # noqa: SIM115
+        # They stay open for as long as the process runs.
+        opened = (open(pipe, encoding="utf-8") for pipe in (said, failed, told))  # noqa: SIM115
+        self.stdout, self.stderr, self._told = opened
         self.pid, self.returncode = int(self._told.readline()), None
 
     def poll(self) -> int | None:
@@ -183,9 +224,13 @@ def _server() -> socket.socket | None:
     mine, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with its:
         # Its imports are those of a command, which sets this before them.
-        server = subprocess.Popen([sys.executable, __file__, str(its.fileno())], pass_fds=[its.fileno()],
-                                  stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                                  env=environment(OPENBLAS_NUM_THREADS="1"))  # fmt: skip
+        server = subprocess.Popen(
+            [sys.executable, __file__, str(its.fileno())],
+            pass_fds=[its.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            env=environment(OPENBLAS_NUM_THREADS="1"),
+        )
 
     def end() -> None:
         mine.close()
@@ -199,7 +244,8 @@ def _server() -> socket.socket | None:
 
 
 def imported() -> bool:
-    """What programs and commands need; no device. Whether there is no thread, which a fork would not have."""
+    """What programs and commands need; no device. Whether there is no thread, which a fork would
+    not have."""
     for name in IMPORTED:
         importlib.import_module(name)
     for name in LAZY:
@@ -219,8 +265,9 @@ def forked(line: socket.socket) -> dict[str, Any]:
                 pid, tell = running.pop(ready)
                 _, status, usage = os.wait4(pid, 0)
                 os.close(ready)
+                code, seconds = os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime
                 with contextlib.suppress(BrokenPipeError):  # nobody waits for it
-                    os.write(tell, f"{os.waitstatus_to_exitcode(status)} {usage.ru_utime + usage.ru_stime}\n".encode())
+                    os.write(tell, f"{code} {seconds}\n".encode())
                 os.close(tell)
                 continue
             data, received, _, _ = socket.recv_fds(line, LONGEST, 3)
@@ -243,7 +290,8 @@ def forked(line: socket.socket) -> dict[str, Any]:
 
 
 def become(request: dict[str, Any], begun: dict[str, str]) -> None:
-    """The environment and folder of a request; JAX has read its variables in those of the process that forks."""
+    """The environment and folder of a request; JAX has read its variables in those of the process
+    that forks."""
     import jax
 
     os.chdir(request["cwd"])

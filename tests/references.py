@@ -1,4 +1,5 @@
-"""What the simulator is compared with, written in NumPy and SciPy straight from the equations, without jaxmuscle."""
+"""What the simulator is compared with, written in NumPy and SciPy straight from the equations,
+without jaxmuscle."""
 
 import numpy as np
 import scipy.integrate
@@ -49,8 +50,12 @@ def contraction(p, x_w, motion, F_ext, u):
 
 def harmonic(p, t):
     """S(t) on (K_w, K_z, C_w, C_z)."""
-    s = p["harmonic_amplitude"] * np.sin(2 * np.pi * p["harmonic_frequency"] * t + p["harmonic_phase"])
-    return np.multiply.outer([p["k_w"] * p["x_ref_w"] ** 2, p["k_z"] * p["x_ref_z"] ** 2, 0.0, 0.0], s)
+    s = p["harmonic_amplitude"] * np.sin(
+        2 * np.pi * p["harmonic_frequency"] * t + p["harmonic_phase"]
+    )
+    return np.multiply.outer(
+        [p["k_w"] * p["x_ref_w"] ** 2, p["k_z"] * p["x_ref_z"] ** 2, 0.0, 0.0], s
+    )
 
 
 def quiet(task, **values):
@@ -81,26 +86,35 @@ def welch_kernel(taper, rate, bins, frequency):
     return np.abs(transform) ** 2 / (rate * np.sum(taper**2))
 
 
-def expected_welch(density, rate=100.0, length=256, bins=range(1, 31), lowpass=(9, 30.0), points=4096):
-    """Expected one-sided Hann-Welch spectrum of a signal of that two-sided density, sampled at `rate`."""
+def expected_welch(
+    density, rate=100.0, length=256, bins=range(1, 31), lowpass=(9, 30.0), points=4096
+):
+    """Expected one-sided Hann-Welch spectrum of a signal of that two-sided density, sampled at
+    `rate`."""
     # Everything is periodic in f, so equally spaced points integrate it to rounding.
     frequency = (np.arange(points) / points - 0.5) * rate
     sampled = aliased(density, rate, frequency)
     if lowpass is not None:
         sos = scipy.signal.butter(lowpass[0], lowpass[1], fs=rate, output="sos")
         sampled = sampled * np.abs(scipy.signal.sosfreqz(sos, np.abs(frequency), fs=rate)[1]) ** 2
-    kernel = welch_kernel(scipy.signal.get_window("hann", length), rate, np.asarray(bins), frequency)
+    kernel = welch_kernel(
+        scipy.signal.get_window("hann", length), rate, np.asarray(bins), frequency
+    )
     return 2 * sampled @ kernel * rate / points
 
 
 def assert_standard_normal(z, every=1):
-    """Deviations in standard errors: the largest within the Šidák bound at 1 %, their squares χ² with p > 0.001.
+    """Deviations in standard errors: the largest within the Šidák bound at 1 %, their squares χ²
+    with p > 0.001.
 
-    `every` picks values far enough apart to be independent for χ² (the bound holds for dependent ones, too).
+    `every` picks values far enough apart to be independent for χ² (the bound holds for dependent
+    ones, too).
     """
     z = np.asarray(z).ravel()
     bound = scipy.stats.norm.isf((1 - 0.99 ** (1 / z.size)) / 2)
-    assert np.abs(z).max() < bound, f"largest deviation {np.abs(z).max():.2f} standard errors, bound {bound:.2f}: {z}"
+    assert np.abs(z).max() < bound, (
+        f"largest deviation {np.abs(z).max():.2f} standard errors, bound {bound:.2f}: {z}"
+    )
     picked = z[::every]
     p = scipy.stats.chi2.sf(np.sum(picked**2), picked.size)
     assert p > 0.001, f"chi2 p = {p:.2g}, deviations in standard errors {z}"

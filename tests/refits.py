@@ -10,7 +10,8 @@ from jaxmuscle.fits._adequacy import Endpoint
 
 @contextlib.contextmanager
 def without_intervals() -> Iterator[None]:
-    """Fits whose 95 % intervals nobody reads: these take most of a refit's time. tests/fits/test_intervals.py has them."""
+    """Fits whose 95 % intervals nobody reads: these take most of a refit's time.
+    tests/fits/test_intervals.py has them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Endpoint, "intervals", lambda ended, names: {})
         yield

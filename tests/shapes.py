@@ -1,8 +1,9 @@
-"""Shapes and types of what the package's functions take and return are checked while tests run: of every function its first
-calls in each test, and some of the others.
+"""Shapes and types of what the package's functions take and return are checked while tests run: of
+every function its first calls in each test, and some of the others.
 
-A check takes longer than most small functions, and a fit calls these by the hundred thousand: checked at every call they
-took more than half of its time. A function that gets or gives a wrong shape does so at its first calls, too.
+A check takes longer than most small functions, and a fit calls these by the hundred thousand:
+checked at every call they took more than half of its time. A function that gets or gives a wrong
+shape does so at its first calls, too.
 """
 
 import functools
@@ -19,7 +20,8 @@ try:
 except ImportError:  # no public part of it
     _decorator = _sentinel = jaxtyped = None
 
-FIRST, EVERY = 4, 128  # calls of a function that are checked in a test: so many, then one of so many
+# calls of a function that are checked in a test: so many, then one of so many
+FIRST, EVERY = 4, 128
 _calls: dict[int, int] = {}
 
 
@@ -53,16 +55,20 @@ def _of_types(function: Any, typechecker: Any) -> Any:
 def _names_arrays(function: Any) -> bool:
     """Whether sizes are to be compared. Types alone are checked in a tenth of the time."""
     kinds = function.__annotations__.values()
-    return any(isinstance(kind, str) or "jaxtyping" in repr(kind) or "~" in repr(kind) for kind in kinds)
+    return any(
+        isinstance(kind, str) or "jaxtyping" in repr(kind) or "~" in repr(kind) for kind in kinds
+    )
 
 
 def _sparingly(function: Any = _sentinel, *, typechecker: Any = _sentinel) -> Any:
-    """As jaxtyping's decorator. What is no function itself (a class, a property) has it decorate its functions with this."""
+    """As jaxtyping's decorator. What is no function itself (a class, a property) has it decorate
+    its functions with this."""
     if not inspect.isfunction(function):
         return jaxtyped(function, typechecker=typechecker)
     if hasattr(function, "sparingly"):  # inherited
         return function
-    code, checked = id(function.__code__), None  # of a function within one the same at each of its calls
+    # of a function within one the same at each of its calls
+    code, checked = id(function.__code__), None
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
@@ -72,7 +78,11 @@ def _sparingly(function: Any = _sentinel, *, typechecker: Any = _sentinel) -> An
             return function(*args, **kwargs)
         if checked is None:
             arrays = _names_arrays(function)
-            checked = jaxtyped(function, typechecker=typechecker) if arrays else _of_types(function, typechecker)
+            checked = (
+                jaxtyped(function, typechecker=typechecker)
+                if arrays
+                else _of_types(function, typechecker)
+            )
         return checked(*args, **kwargs)
 
     wrapper.sparingly = True  # pyright: ignore[reportAttributeAccessIssue]

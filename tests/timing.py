@@ -1,7 +1,8 @@
 """Where the seconds of a test run go: a table by file and by phase, printed at its end.
 
-JAX tells how long it traces, lowers and compiles; the rest of a test is running, or waiting for commands that it started. A
-function that is traced within another counts once. Everything also goes to .test-out/timing.json.
+JAX tells how long it traces, lowers and compiles; the rest of a test is running, or waiting for
+commands that it started. A function that is traced within another counts once. Everything also goes
+to .test-out/timing.json.
 """
 
 import json
@@ -20,15 +21,41 @@ EVENTS = {
     "/jax/core/compile/jaxpr_trace_duration": "trace",
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "lower",
     "/jax/core/compile/backend_compile_duration": "compile",
-    "/jax/compilation_cache/cache_retrieval_time_sec": "load",  # a compiled program read from the cache
+    # a compiled program read from the cache
+    "/jax/compilation_cache/cache_retrieval_time_sec": "load",
 }
 LONGEST_FIRST = (
-    "test_pages", "test_perturbed_fit", "test_moved", "test_input_design", "test_fit", "test_hill", "test_expected",
-    "test_joint", "test_trials", "test_goodness", "test_ensemble",
-    "test_several", "test_compare", "test_posterior", "test_study", "test_control", "test_slow", "test_adequacy",
-    "test_ladder", "test_rungs", "test_gradients", "test_drive", "test_tremor", "test_pink", "test_simulate",
-    "test_reproduce", "test_scaling", "test_identify", "test_likelihood", "test_cli",
-)  # fmt: skip
+    "test_pages",
+    "test_perturbed_fit",
+    "test_moved",
+    "test_input_design",
+    "test_fit",
+    "test_hill",
+    "test_expected",
+    "test_joint",
+    "test_trials",
+    "test_goodness",
+    "test_ensemble",
+    "test_several",
+    "test_compare",
+    "test_posterior",
+    "test_study",
+    "test_control",
+    "test_slow",
+    "test_adequacy",
+    "test_ladder",
+    "test_rungs",
+    "test_gradients",
+    "test_drive",
+    "test_tremor",
+    "test_pink",
+    "test_simulate",
+    "test_reproduce",
+    "test_scaling",
+    "test_identify",
+    "test_likelihood",
+    "test_cli",
+)
 COUNTS = {"compile": "compiled", "load": "loaded"}
 HEADING = f"{'seconds':>32} " + "".join(f"{column:>9}" for column in (*PHASES, *COUNTS.values()))
 
@@ -45,7 +72,8 @@ def seconds_of_commands() -> float:
 
 
 class Phases:
-    """Seconds that JAX spent in each phase since the last look, without counting nested ones twice."""
+    """Seconds that JAX spent in each phase since the last look, without counting nested ones
+    twice."""
 
     def __init__(self) -> None:
         self.spans: list[tuple[float, float]] = []
@@ -58,7 +86,8 @@ class Phases:
             return
         end = time.perf_counter()
         start, own = end - duration, duration
-        while self.spans and self.spans[-1][0] >= start - 1e-6:  # ended earlier and began later: within this one
+        # ended earlier and began later: within this one
+        while self.spans and self.spans[-1][0] >= start - 1e-6:
             inner = self.spans.pop()
             own -= inner[1] - inner[0]
         self.spans.append((start, end))
@@ -138,6 +167,7 @@ class Timing:
 def row(name: str, found: Counter[str]) -> str:
     whole = sum(found[phase] for phase in PHASES)
     seconds, counts = (
-        "".join(f"{found[c]:{f}}" for c in columns) for columns, f in ((PHASES, "9.1f"), (COUNTS.values(), "9.0f"))
+        "".join(f"{found[c]:{f}}" for c in columns)
+        for columns, f in ((PHASES, "9.1f"), (COUNTS.values(), "9.0f"))
     )
     return f"{name:>24} {whole:7.1f} {seconds}{counts}"

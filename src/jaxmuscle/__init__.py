@@ -1,7 +1,7 @@
 """jaxmuscle: a differentiable stochastic rheological muscle, and its fit to measured force spectra.
 
-The public names are listed in `__init__.pyi`; each is imported when it is first used, so that `jaxmuscle targets` does
-not wait for JAX.
+The public names are listed in `__init__.pyi`; each is imported when it is first used, so that
+`jaxmuscle targets` does not wait for JAX.
 """
 
 import lazy_loader

@@ -1,4 +1,5 @@
-"""The names of everyday work. The others are in the wings, `jaxmuscle.spectra`, `jaxmuscle.model` and so on."""
+"""The names of everyday work. The others are in the wings, `jaxmuscle.spectra`, `jaxmuscle.model`
+and so on."""
 
 from . import checks as checks
 from . import comparison as comparison

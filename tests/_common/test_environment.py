@@ -1,4 +1,5 @@
-"""The surroundings of a fit: double precision, one thread of linear algebra, everything as before afterwards."""
+"""The surroundings of a fit: double precision, one thread of linear algebra, everything as before
+afterwards."""
 
 import contextlib
 
@@ -12,7 +13,9 @@ from jaxmuscle._common.environment import fitting
 
 def threads():
     np.linalg.inv(np.eye(2))
-    return [one["num_threads"] for one in threadpoolctl.threadpool_info() if one["user_api"] == "blas"]
+    return [
+        one["num_threads"] for one in threadpoolctl.threadpool_info() if one["user_api"] == "blas"
+    ]
 
 
 def test_linear_algebra_has_one_thread_until_the_last_fit_has_ended():

@@ -45,14 +45,41 @@ def test_texts_are_no_markup(tmp_path):
     pages.write_page(tmp_path / "page.html", HOSTILE, body)
     seen = Seen((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert {tag for tag, _ in seen.elements} == {
-        *("html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "ul", "li", "code", "pre", "div"),
+        *(
+            "html",
+            "head",
+            "meta",
+            "title",
+            "style",
+            "body",
+            "h1",
+            "h2",
+            "p",
+            "ul",
+            "li",
+            "code",
+            "pre",
+            "div",
+        ),
         *("table", "thead", "tbody", "tr", "th", "td", "figure", "img", "figcaption"),
     }
     assert {name for _, given in seen.elements for name in given} <= {
-        "lang", "charset", "http-equiv", "content", "name", "class", "scope", "data-label", "width", "alt", "src"
-    }  # fmt: skip
+        "lang",
+        "charset",
+        "http-equiv",
+        "content",
+        "name",
+        "class",
+        "scope",
+        "data-label",
+        "width",
+        "alt",
+        "src",
+    }
     assert seen.words.count(HOSTILE) == 11
-    assert [given["src"][:26] for tag, given in seen.elements if tag == "img"] == ["data:image/svg+xml;base64,"]
+    assert [given["src"][:26] for tag, given in seen.elements if tag == "img"] == [
+        "data:image/svg+xml;base64,"
+    ]
 
 
 def test_a_page_may_load_nothing_and_is_read_in_light_dark_and_print(tmp_path):
@@ -61,7 +88,8 @@ def test_a_page_may_load_nothing_and_is_read_in_light_dark_and_print(tmp_path):
     assert "default-src 'none'; img-src data:; style-src 'unsafe-inline'" in text
     assert not re.search(r"https?://|url\(|@import|<script|<link", text)
     assert all(
-        f"@media {kind}" in text for kind in ("screen and (prefers-color-scheme:dark)", "screen and (max-width", "print")
+        f"@media {kind}" in text
+        for kind in ("screen and (prefers-color-scheme:dark)", "screen and (max-width", "print")
     )
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"] and "half ? a letter" in text
 
@@ -69,13 +97,19 @@ def test_a_page_may_load_nothing_and_is_read_in_light_dark_and_print(tmp_path):
 def test_a_table_leaves_out_what_is_empty():
     seen = Seen(pages.table(("name", "value", "unit"), [("a", "1", ""), ("b", "2", "")]))
     assert seen.words == ["name", "value", "a", "1", "b", "2"]
-    assert [given["data-label"] for tag, given in seen.elements if tag == "td"] == ["name", "value"] * 2
+    assert [given["data-label"] for tag, given in seen.elements if tag == "td"] == [
+        "name",
+        "value",
+    ] * 2
 
 
 @pytest.mark.parametrize(("pixels", "start"), [(False, b"<?xml"), (True, b"\x89PNG")])
 def test_a_picture_stands_in_the_page_the_same_each_time(pixels, start):
     figure, _ = plt.subplots(figsize=(2, 1))
-    once, again = (pages.picture(figure, "words", pixels=pixels_of(figure) if pixels else None) for _ in range(2))
+    once, again = (
+        pages.picture(figure, "words", pixels=pixels_of(figure) if pixels else None)
+        for _ in range(2)
+    )
     plt.close(figure)
     (data,) = re.findall(r"base64,([^']+)'", once)
     assert base64.b64decode(data).startswith(start) and once == again

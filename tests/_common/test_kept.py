@@ -1,4 +1,5 @@
-"""Compiled programs that outlive the process: loaded where nothing changed, made again where anything stands against it."""
+"""Compiled programs that outlive the process: loaded where nothing changed, made again where
+anything stands against it."""
 
 import os
 import threading
@@ -50,7 +51,9 @@ def test_a_second_process_traces_nothing(x64, folder):
         np.testing.assert_array_equal(first(TASK, MATRIX)[name], second(TASK, MATRIX)[name])
     assert_right(second(TASK, 1.0 * MATRIX, 2.5), 2.5)  # another fixed number is another program
     other = second(as_arrays(TASK.replace(k_w=4e5), np.float64), MATRIX)  # other numbers are not
-    assert float(other["base"][0]) == pytest.approx(float(TASK.muscle.base()[0]) * 4e5 / float(TASK["k_w"]))
+    assert float(other["base"][0]) == pytest.approx(
+        float(TASK.muscle.base()[0]) * 4e5 / float(TASK["k_w"])
+    )
     assert second.traces == 1
 
 
@@ -75,7 +78,9 @@ def test_precision_makes_another_program(folder):
     assert program(TASK, MATRIX)["x"].dtype == jnp.float32 and program.traces == 2
 
 
-@pytest.mark.parametrize("damage", [lambda b: b[:-7], lambda b: b[:50] + bytes([b[50] ^ 1]) + b[51:], lambda b: b""])
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[:-7], lambda b: b[:50] + bytes([b[50] ^ 1]) + b[51:], lambda b: b""]
+)
 def test_a_damaged_file_is_made_again(x64, folder, damage):
     assert_right(Kept(solved)(TASK, MATRIX))
     files = [path for path in folder.rglob("*") if path.is_file()]
@@ -87,7 +92,9 @@ def test_a_damaged_file_is_made_again(x64, folder, damage):
     assert again.traces == 1
 
 
-def test_changed_code_is_traced_again_and_compiled_only_if_it_says_something_else(x64, folder, monkeypatch):
+def test_changed_code_is_traced_again_and_compiled_only_if_it_says_something_else(
+    x64, folder, monkeypatch
+):
     assert_right(Kept(solved)(TASK, MATRIX))
     before = {path for path in folder.iterdir() if path.is_file()}
     monkeypatch.setattr(programs, "_code", lambda: "f" * 64)
@@ -128,7 +135,8 @@ def test_what_nobody_uses_is_removed_when_the_code_changes(x64, folder, monkeypa
 
 def test_what_holds_an_own_class_is_not_kept(x64, tmp_path, monkeypatch):
     class Own(Muscle):
-        """Somebody else's muscle, whose code may change without a sign. The tests keep what stands in a file, not this."""
+        """Somebody else's muscle, whose code may change without a sign. The tests keep what stands
+        in a file, not this."""
 
     monkeypatch.setattr(programs, "program_folder", lambda: tmp_path)
     task = TASK.with_parts(muscle=Own())
@@ -180,7 +188,8 @@ def test_fixed_outputs_and_modules_come_back(x64, folder):
 
 
 def test_what_a_loaded_program_gives_is_the_same_argument_for_the_next(x64, folder):
-    """A module's `repr` leaves out a field that is the default object; what was read from a file is another object."""
+    """A module's `repr` leaves out a field that is the default object; what was read from a file is
+    another object."""
 
     def stiffer(task):
         return task.replace(k_w=2.0 * task["k_w"])
@@ -194,14 +203,18 @@ def test_what_a_loaded_program_gives_is_the_same_argument_for_the_next(x64, fold
 
 def test_threads_make_one_result(x64, folder):
     program, found = Kept(solved), []
-    threads = [threading.Thread(target=lambda: found.append(program(TASK, MATRIX))) for _ in range(4)]
+    threads = [
+        threading.Thread(target=lambda: found.append(program(TASK, MATRIX))) for _ in range(4)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
     assert len(found) == 4
     for result in found:
-        np.testing.assert_allclose(np.asarray(result["x"], float), np.linalg.solve(MATRIX, MATRIX[0]), rtol=1e-5)
+        np.testing.assert_allclose(
+            np.asarray(result["x"], float), np.linalg.solve(MATRIX, MATRIX[0]), rtol=1e-5
+        )
 
 
 SOLVED = """
@@ -220,7 +233,10 @@ def test_between_processes(tmp_path):
     """Two at once, then one more, which traces nothing. Without a cache there are no files."""
     users: Any = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "jax"), "XLA_FLAGS": ""}
     off = users | {"JAXMUSCLE_CACHE": "off", "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "none")}
-    alone, *both = [ended(one)[0].partition("-") for one in [python(SOLVED, **given) for given in (off, users, users)]]
+    alone, *both = [
+        ended(one)[0].partition("-")
+        for one in [python(SOLVED, **given) for given in (off, users, users)]
+    ]
     assert alone[0] == "1" and not (tmp_path / "none" / "jaxmuscle").exists()
     last = ended(python(SOLVED, **users))[0].partition("-")
     assert last[0] == "0" and all(found[2] == last[2] for found in (alone, *both))
@@ -232,7 +248,8 @@ from jaxmuscle.response import _expected
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")  # as the tests
 power = np.asarray(jm.expected_spectrum(jm.Isometric()).power)
-heavy = {"diffrax", "optimistix", "scipy.signal", "scipy.stats", "matplotlib", "rich"} & set(sys.modules)
+heavy = {"diffrax", "optimistix", "scipy.signal", "scipy.stats", "matplotlib", "rich"}
+heavy &= set(sys.modules)
 print(_expected._compiled_response.traces, power.tobytes().hex(), len(heavy))
 """
 

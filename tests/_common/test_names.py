@@ -1,4 +1,5 @@
-"""Names out of data as names of files: they stay in their folder, on any system, and no two are one."""
+"""Names out of data as names of files: they stay in their folder, on any system, and no two are
+one."""
 
 import ntpath
 from pathlib import PurePosixPath, PureWindowsPath
@@ -63,15 +64,26 @@ def test_any_name_stays_in_its_folder(name):
 
 
 def test_clashes_are_numbered_in_their_order_and_good_names_come_first():
-    found = file_names(["x/y", "Anna", "anna", "x_y", "ANNA", "anna-2", "Cohort.csv"], taken=["cohort.csv"])
-    assert found == {"x/y": "x_y-2", "Anna": "Anna", "anna": "anna-2", "x_y": "x_y", "ANNA": "ANNA-3",
-                     "anna-2": "anna-2-2", "Cohort.csv": "Cohort.csv-2"}  # fmt: skip
+    found = file_names(
+        ["x/y", "Anna", "anna", "x_y", "ANNA", "anna-2", "Cohort.csv"], taken=["cohort.csv"]
+    )
+    assert found == {
+        "x/y": "x_y-2",
+        "Anna": "Anna",
+        "anna": "anna-2",
+        "x_y": "x_y",
+        "ANNA": "ANNA-3",
+        "anna-2": "anna-2-2",
+        "Cohort.csv": "Cohort.csv-2",
+    }
 
 
 @given(st.lists(st.text("aA/._-ß", max_size=4), max_size=20, unique=True))
 def test_no_two_are_one(names):
     found = file_names(names)
-    assert list(found) == names and len({place.casefold() for place in found.values()}) == len(names)
+    assert list(found) == names and len({place.casefold() for place in found.values()}) == len(
+        names
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""Progress: a function, silence, or lines every so often where there is no terminal, also while nothing is told."""
+"""Progress: a function, silence, or lines every so often where there is no terminal, also while
+nothing is told."""
 
 import logging
 import queue
@@ -12,7 +13,8 @@ from jaxmuscle._common.progress import nothing, told
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Lines come every 20 ms. Gives a function that waits for the next line, and returns it and when it was said."""
+    """Lines come every 20 ms. Gives a function that waits for the next line, and returns it and
+    when it was said."""
     said, say = queue.SimpleQueue(), progress._say
 
     def heard(line):
@@ -38,11 +40,13 @@ def test_lines_go_on_while_nothing_is_told(quick, capfd, monkeypatch):
     monkeypatch.setattr(progress.LOG, "hasHandlers", lambda: False)
     with told(True, "fitting x") as tell:
         tell("compiling", 0.25)
-        while quick()[0].startswith("fitting x: 0 %, starting"):  # where 20 ms had passed before anything was told
+        # where 20 ms had passed before anything was told
+        while quick()[0].startswith("fitting x: 0 %, starting"):
             pass
         whole = [quick() for _ in range(3)]
     assert all(line.startswith("fitting x: 25 %, compiling (") for line, _ in whole)
-    assert whole[-1][1] - whole[0][1] > 1.9 * 0.02  # twice 20 ms at least, however slow the machine is
+    # twice 20 ms at least, however slow the machine is
+    assert whole[-1][1] - whole[0][1] > 1.9 * 0.02
     assert {line for line, _ in whole} <= set(capfd.readouterr().err.splitlines())
 
 

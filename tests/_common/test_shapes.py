@@ -29,7 +29,9 @@ def looked_at(calls):
 
 def test_the_first_calls_in_each_test_and_some_of_the_others():
     most = shapes.FIRST + 3 * shapes.EVERY
-    expected = [call for call in range(1, most + 1) if call <= shapes.FIRST or call % shapes.EVERY == 0]
+    expected = [
+        call for call in range(1, most + 1) if call <= shapes.FIRST or call % shapes.EVERY == 0
+    ]
     assert looked_at(most) == expected
     assert looked_at(1) == []  # the same function, made again within the test
     shapes.begin_anew()

@@ -1,4 +1,5 @@
-"""Is it right: p-values are uniform where the model is true and small where it is not; stated errors against refits."""
+"""Is it right: p-values are uniform where the model is true and small where it is not; stated
+errors against refits."""
 
 import functools
 import json
@@ -52,7 +53,11 @@ def fits(powers, segments=12, sigma=None, free=FREE, base=None):
     """Fits of many spectra of the same kind in one batch."""
     with jax.enable_x64(True):
         plans = [
-            planned(base or task(), Target(f"case{i}", p, segments=segments, sigma=sigma), FitOptions(free=free, starts=8))
+            planned(
+                base or task(),
+                Target(f"case{i}", p, segments=segments, sigma=sigma),
+                FitOptions(free=free, starts=8),
+            )
             for i, p in enumerate(powers)
         ]
         return search_together(plans, lambda text, share: None)
@@ -60,7 +65,8 @@ def fits(powers, segments=12, sigma=None, free=FREE, base=None):
 
 @pytest.fixture(autouse=True)
 def _few_starts(monkeypatch):
-    """Of the refits of a bootstrap: two parameters without a harmonic have one minimum, which eight starts do not miss."""
+    """Of the refits of a bootstrap: two parameters without a harmonic have one minimum, which eight
+    starts do not miss."""
     monkeypatch.setattr(_bootstrap, "STARTS", 8)
 
 
@@ -76,7 +82,9 @@ def drawn_fits():
     with jax.enable_x64(True):
         problem = reopened(result)
         (moments,) = repeated(problem, (task(),), CASES)
-        powers = drawn_spectra(Likelihood.of(problem).bins[0], result.target, moments, jax.random.key(5))
+        powers = drawn_spectra(
+            Likelihood.of(problem).bins[0], result.target, moments, jax.random.key(5)
+        )
     with without_intervals():
         return fits(list(powers))
 
@@ -90,8 +98,16 @@ def test_three_numbers_of_known_residuals():
 
 
 def test_p_values_count_ties_as_extreme_and_few_runs_as_extreme():
-    reference = {"chi2_per_bin": np.arange(99.0), "runs": np.full(99, 5.0), "largest": np.arange(99.0)}
-    observed = {"chi2_per_bin": np.array([98.0]), "runs": np.array([5.0]), "largest": np.array([200.0])}
+    reference = {
+        "chi2_per_bin": np.arange(99.0),
+        "runs": np.full(99, 5.0),
+        "largest": np.arange(99.0),
+    }
+    observed = {
+        "chi2_per_bin": np.array([98.0]),
+        "runs": np.array([5.0]),
+        "largest": np.array([200.0]),
+    }
     found = p_values(observed, reference)
     assert found["chi2_per_bin"] == pytest.approx(2 / 100)
     assert found["runs"] == 1.0
@@ -99,12 +115,15 @@ def test_p_values_count_ties_as_extreme_and_few_runs_as_extreme():
     assert found["all"] == pytest.approx(1 / 100)  # no replicate has a number beyond all others
     tied = p_values(observed | {"largest": np.array([98.0])}, reference)
     assert tied["all"] == pytest.approx(2 / 100)  # the last replicate is as extreme in both
-    assert p_values(observed | {"runs": np.array([4.0])}, reference)["runs"] == pytest.approx(1 / 100)
+    assert p_values(observed | {"runs": np.array([4.0])}, reference)["runs"] == pytest.approx(
+        1 / 100
+    )
 
 
 @pytest.mark.slow
 def test_reference_runs_are_those_of_correlated_bins(x64):
-    """Orthant probability: neighbours of correlation c differ in sign with probability arccos(c)/π (many segments)."""
+    """Orthant probability: neighbours of correlation c differ in sign with probability arccos(c)/π
+    (many segments)."""
     target, rows = Target("flat", np.ones(30), segments=2000), 4000
     problem = reopened(perfect(), target)
     (moments,) = repeated(problem, (task(),), rows)
@@ -117,7 +136,8 @@ def test_reference_runs_are_those_of_correlated_bins(x64):
     covariance = centre @ (sd[:, None] * law.correlation * sd) @ centre
     c = np.diag(covariance, 1) / np.sqrt(np.diag(covariance)[1:] * np.diag(covariance)[:-1])
     wanted = 1 + np.sum(np.arccos(c)) / np.pi
-    # 4 standard errors of the mean, and what is left of the skewness of the log at 4000 degrees of freedom.
+    # 4 standard errors of the mean, and what is left of the skewness of the log at 4000 degrees of
+    # freedom.
     assert abs(runs.mean() - wanted) < 4 * runs.std() / np.sqrt(rows) + 0.02
     assert wanted < 13  # Wald and Wolfowitz: 15.5
 
@@ -125,33 +145,43 @@ def test_reference_runs_are_those_of_correlated_bins(x64):
 @pytest.mark.slow
 def test_p_values_are_uniform_where_the_model_is_true():
     replicates = 19
-    found = [jm.goodness(result, replicates=replicates, key=i) for i, result in enumerate(drawn_fits())]
+    found = [
+        jm.goodness(result, replicates=replicates, key=i) for i, result in enumerate(drawn_fits())
+    ]
     for name in ("chi2_per_bin", "largest", "all"):
         values = [g.p_values[name] for g in found]
-        # p-values are whole twentieths, the largest of those that lie within 1/20 above a uniform number: the deviation
-        # that 20 uniform numbers exceed with probability `SURE`, 0.42, and 1/20.
+        # p-values are whole twentieths, the largest of those that lie within 1/20 above a uniform
+        # number: the deviation that 20 uniform numbers exceed with probability `SURE`, 0.42, and
+        # 1/20.
         most = scipy.stats.kstwo.ppf(1 - SURE, CASES) + 1 / (replicates + 1)
         assert scipy.stats.kstest(values, "uniform").statistic < most, name
     few = sum(g.p_values["runs"] <= 0.05 for g in found)
     assert few <= scipy.stats.binom.ppf(1 - SURE, CASES, 0.05)
     reference = np.mean([g.reference["chi2_per_bin"].mean() for g in found])
-    # Replicates of standard deviation 0.28, and 0.02 for what is not linear in θ and in the log powers: 0.08 together. What
-    # two parameters take up is 0.14.
+    # Replicates of standard deviation 0.28, and 0.02 for what is not linear in θ and in the log
+    # powers: 0.08 together. What two parameters take up is 0.14.
     assert abs(reference - linear_chi2(perfect())) < 4 * 0.28 / np.sqrt(replicates * CASES) + 0.02
 
 
 def linear_chi2(result):
-    """`tr(M Σ Mᵀ) / (bins - 1)`, M = I - J (JᵀJ + Λ)⁻¹ Jᵀ what a fit leaves of the residuals, Σ their covariance.
+    """`tr(M Σ Mᵀ) / (bins - 1)`, M = I - J (JᵀJ + Λ)⁻¹ Jᵀ what a fit leaves of the residuals, Σ
+    their covariance.
 
-    Smooth columns of J take up nearly two degrees of freedom each, since neighbouring bins correlate.
+    Smooth columns of J take up nearly two degrees of freedom each, since neighbouring bins
+    correlate.
     """
     with jax.enable_x64(True):
         problem = reopened(result)
         objective = problem.linear()
-        J = consequences(objective, expand(objective, problem.theta_of((result.task,))[None]).row(0)).jacobian
+        J = consequences(
+            objective, expand(objective, problem.theta_of((result.task,))[None]).row(0)
+        ).jacobian
     n = len(J)
     law = welch_law(result.target.settings, result.target.bins, result.target.segments)
-    sd = np.sqrt(scipy.special.polygamma(1, law.degrees / 2) / scipy.special.polygamma(1, law.degrees[n // 2] / 2))
+    sd = np.sqrt(
+        scipy.special.polygamma(1, law.degrees / 2)
+        / scipy.special.polygamma(1, law.degrees[n // 2] / 2)
+    )
     centre = np.eye(n) - 1 / n
     left = (np.eye(n) - J @ np.linalg.inv(J.T @ J + np.diag(problem.prior)) @ J.T) @ centre
     return np.trace(left @ (sd[:, None] * law.correlation * sd) @ left.T) / (n - 1)
@@ -177,17 +207,22 @@ def test_smooth_misfit_is_found_by_the_runs():
 
 @pytest.mark.slow
 def test_refits_reach_the_minima_of_a_full_search(x64):
-    """Four starts for each replicate against the 32 of a fit, with a harmonic that may go anywhere."""
+    """Four starts for each replicate against the 32 of a fit, with a harmonic that may go
+    anywhere."""
     base = task().replace(harmonic_amplitude=0.005, harmonic_frequency=4.3)
     free = (*FREE, "harmonic_amplitude", "harmonic_frequency")
     power = np.asarray(jm.expected_spectrum(base).power)
     problem = reopened(fits([power / power.sum()], free=free, base=base)[0])
     (moments,), (part,) = repeated(problem, (base,), 12), problem.parts
     drawn = drawn_spectra(Likelihood.of(problem).bins[0], part.target, moments, jax.random.key(3))
-    found = refitted(problem, problem.theta_of((base,)), Drawn((drawn,), (power / power.sum(),), *((None,),) * 3))
+    found = refitted(
+        problem, problem.theta_of((base,)), Drawn((drawn,), (power / power.sum(),), *((None,),) * 3)
+    )
     with without_intervals():
         full = fits(list(drawn), free=free, base=base)
-    mine = numbers_of(residuals_of(drawn, found.expected[0], part.target, found.share[0]))["chi2_per_bin"]
+    mine = numbers_of(residuals_of(drawn, found.expected[0], part.target, found.share[0]))[
+        "chi2_per_bin"
+    ]
     theirs = np.array([result.chi2_per_bin for result in full])
     assert np.sum(np.abs(mine - theirs) < 0.02 * theirs + 1e-3) >= 11
     assert abs(mine.mean() - theirs.mean()) < 0.03
@@ -196,14 +231,24 @@ def test_refits_reach_the_minima_of_a_full_search(x64):
 @pytest.mark.slow
 def test_another_target_is_foretold_not_fitted():
     first, second = drawn_fits()[:2]
-    own, other = jm.goodness(first, replicates=199), jm.goodness(first, second.target, replicates=199)
+    own, other = (
+        jm.goodness(first, replicates=199),
+        jm.goodness(first, second.target, replicates=199),
+    )
     assert other.foretold and not own.foretold
-    # A spectrum that was not fitted lies further from the fit: twice the take-up of two parameters, 2 · 2 of 29.
+    # A spectrum that was not fitted lies further from the fit: twice the take-up of two parameters,
+    # 2 · 2 of 29.
     excess = other.reference["chi2_per_bin"].mean() - own.reference["chi2_per_bin"].mean()
     assert 0.02 < excess < 0.4
     np.testing.assert_allclose(
-        other.residual, residuals_of(second.target.proportional_power[None], first.fitted[None], second.target,
-                                     first.harmonic_share[None])[0])  # fmt: skip
+        other.residual,
+        residuals_of(
+            second.target.proportional_power[None],
+            first.fitted[None],
+            second.target,
+            first.harmonic_share[None],
+        )[0],
+    )
 
 
 @pytest.mark.slow
@@ -215,7 +260,10 @@ def test_key_decides_and_figures_are_drawn():
     assert not np.array_equal(a.residuals, c.residuals)
     assert a.observed["chi2_per_bin"] == pytest.approx(result.chi2_per_bin)
     table = a.to_dataframe().set_index("check")
-    assert dict(table["observed"]) == a.observed and dict(table["p_value"]).items() < a.p_values.items()
+    assert (
+        dict(table["observed"]) == a.observed
+        and dict(table["p_value"]).items() < a.p_values.items()
+    )
     assert max(map(len, str(a).splitlines())) <= 80
     figure = a.plot()
     assert len(figure.axes) == 4
@@ -265,7 +313,8 @@ def bootstrapped():
 
 
 def bounds(q):
-    """Two-sided bounds of the ratio by χ²(n-1), and the lower one of the coverage by the binomial law."""
+    """Two-sided bounds of the ratio by χ²(n-1), and the lower one of the coverage by the binomial
+    law."""
     n = len(q.values)
     low, high = np.sqrt(scipy.stats.chi2.ppf([SURE / 2, 1 - SURE / 2], n - 1) / (n - 1))
     return low, high, scipy.stats.binom.ppf(SURE / 2, q.inside[1], 0.95)
@@ -289,7 +338,11 @@ def test_bootstrap_is_told_saved_and_drawn(tmp_path):
     assert found.success == (all(q.verdict == "holds" for q in found.quantities.values()))
     found.save(tmp_path / "b.json")
     table = json.loads((tmp_path / "b.json").read_text())
-    assert [row["quantity"] for row in table["table"]] == list(found.quantities) == list(found.to_dataframe()["quantity"])
+    assert (
+        [row["quantity"] for row in table["table"]]
+        == list(found.quantities)
+        == list(found.to_dataframe()["quantity"])
+    )
     np.testing.assert_array_equal(table["refits"]["c_w"]["values"], found.quantities["c_w"].values)
     figure = found.plot()
     assert len(figure.axes) == len(found.quantities)
@@ -301,7 +354,10 @@ def test_bootstrap_of_a_sigma_draws_from_the_gaussian_law():
     result = fits([expected()], segments=None, sigma=0.2 * expected())[0]
     with without_intervals():
         found = jm.bootstrap(result, replicates=20, key=1)
-        a, b, c = (jm.bootstrap(result, replicates=2, key=key).quantities["c_w"].values for key in (1, 1, 2))
+        a, b, c = (
+            jm.bootstrap(result, replicates=2, key=key).quantities["c_w"].values
+            for key in (1, 1, 2)
+        )
     assert "not simulated" in str(found).replace("\n  ", " ")
     for q in found.quantities.values():
         low, high, least = bounds(q)
@@ -328,14 +384,18 @@ def test_what_cannot_be_simulated_is_reported(monkeypatch):
 
 @pytest.mark.slow
 def test_simulated_recordings_scatter_as_the_law_says(x64):
-    """Mean and spread of one bin's power over the replicates against ν of its segments; trials count by their length."""
+    """Mean and spread of one bin's power over the replicates against ν of its segments; trials
+    count by their length."""
     trials = Target("trials", expected(), segments=(4, 8))
     made, failed = _bootstrap_data.replicates_of(reopened(perfect(), trials), (task(),), 64)
     assert not failed and made[0][0][0].segments == (4, 8)
-    logs = np.log(np.stack([target.proportional_power for ((target, _),) in made.values()]) / expected())
+    logs = np.log(
+        np.stack([target.proportional_power for ((target, _),) in made.values()]) / expected()
+    )
     nu = trials.degrees_of_freedom
     # Bins 10 to 25, of little power, hardly feel the normalisation.
     spread = logs[:, 10:25].var(axis=0, ddof=1).mean()
     wanted = scipy.special.polygamma(1, nu / 2)
-    # 64 rows of 15 bins, neighbours correlated: about 8 independent ones; four standard errors, and the common total.
+    # 64 rows of 15 bins, neighbours correlated: about 8 independent ones; four standard errors, and
+    # the common total.
     assert abs(spread / wanted - 1) < 4 * np.sqrt(2 / (63 * 8)) + 0.1

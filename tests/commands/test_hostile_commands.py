@@ -1,4 +1,5 @@
-"""Commands and hostile input: what is no file, a reader that crashes, and names that lead elsewhere."""
+"""Commands and hostile input: what is no file, a reader that crashes, and names that lead
+elsewhere."""
 
 import json
 import os
@@ -20,7 +21,8 @@ POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
 
 @pytest.fixture(autouse=True)
 def keep_settings(monkeypatch):
-    """Commands switch cache, precision and devices; the tests keep theirs. Messages are not to be broken into lines."""
+    """Commands switch cache, precision and devices; the tests keep theirs. Messages are not to be
+    broken into lines."""
     monkeypatch.setenv("COLUMNS", "1000")
     jax.devices()  # from now on there can be no more of them
     before = jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64
@@ -31,14 +33,20 @@ def keep_settings(monkeypatch):
 
 def run(*arguments):
     result = CliRunner().invoke(app, [str(a) for a in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(
+        result.exception
+    )
     assert "Traceback" not in result.output
     return result
 
 
 def refused(result, words):
     """Exit code 2 and one sentence."""
-    assert result.exit_code == 2 and words in result.stderr and len(result.stderr.strip().splitlines()) == 1
+    assert (
+        result.exit_code == 2
+        and words in result.stderr
+        and len(result.stderr.strip().splitlines()) == 1
+    )
 
 
 COMMANDS = {
@@ -66,7 +74,10 @@ def test_a_command_does_not_wait_for_a_pipe(command, tmp_path):
     name, before = COMMANDS[command]
     path, out = tmp_path / name, [] if command == "speed" else ["--out", tmp_path / "out"]
     os.mkfifo(path)
-    first, recordings = command.partition(" ")[0], 2 * ["--recording", path] if command == "reproduce" else []
+    first, recordings = (
+        command.partition(" ")[0],
+        2 * ["--recording", path] if command == "reproduce" else [],
+    )
     refused(run(first, *before, path, *recordings, *out), f"{path}: is a named pipe; give ")
 
 
@@ -76,12 +87,17 @@ def test_a_reader_that_crashes_is_exit_code_2(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     path = tmp_path / "trial.c3d"
     path.write_bytes(b"c3d")
-    refused(run("analyse", path, "--out", tmp_path / "out"), f"{path}: cannot be read as .c3d: its reader crashed (SIGABRT)")
+    refused(
+        run("analyse", path, "--out", tmp_path / "out"),
+        f"{path}: cannot be read as .c3d: its reader crashed (SIGABRT)",
+    )
 
 
 def test_names_out_of_files_do_nothing_to_the_terminal(tmp_path):
     path = tmp_path / "trial.csv"
-    path.write_text("time,a\x1b[2J,b\n" + "".join(f"{i / 100},{i % 7},{i % 5}\n" for i in range(200)))
+    path.write_text(
+        "time,a\x1b[2J,b\n" + "".join(f"{i / 100},{i % 7},{i % 5}\n" for i in range(200))
+    )
     result = run("analyse", path, "--out", tmp_path / "out")
     refused(result, "a\\x1b[2J")
     assert "\x1b" not in result.stderr
@@ -108,14 +124,31 @@ def test_a_message_quotes_no_whole_file(tmp_path):
 def test_groups_that_are_no_text(text, message, tmp_path):
     path = tmp_path / "groups.csv"
     path.write_bytes(text)
-    result = run("fit", "fdi-abduction-45mvc", "vastus-lateralis-26mvc", "--groups", path, "--out", tmp_path / "out")
+    result = run(
+        "fit",
+        "fdi-abduction-45mvc",
+        "vastus-lateralis-26mvc",
+        "--groups",
+        path,
+        "--out",
+        tmp_path / "out",
+    )
     refused(result, f"{path}: {message}")
 
 
 NAMES = {
-    "../../x": "___.._x", "/absolute": "_absolute", "Anna": "Anna", "anna": "anna-2", "a/b": "a_b-2", "a_b": "a_b",
-    "cohort.csv": "cohort.csv-2", "nul": "_nul", "a\0b\x1b[2J": "a_b_[2J", "..": "_", "x" * 300: "x" * 100,
-}  # fmt: skip
+    "../../x": "___.._x",
+    "/absolute": "_absolute",
+    "Anna": "Anna",
+    "anna": "anna-2",
+    "a/b": "a_b-2",
+    "a_b": "a_b",
+    "cohort.csv": "cohort.csv-2",
+    "nul": "_nul",
+    "a\0b\x1b[2J": "a_b_[2J",
+    "..": "_",
+    "x" * 300: "x" * 100,
+}
 
 
 @pytest.mark.slow
@@ -126,7 +159,10 @@ def test_fits_of_many_targets_stay_in_their_folder(tmp_path, monkeypatch):
     paths = [inner / f"{number}.toml" for number in range(len(NAMES))]
     for path, name in zip(paths, NAMES, strict=True):
         path.write_text(tomli_w.dumps(jm.Target("name", POWER).to_table() | {"name": name}))
-    fitted = lambda targets, **options: jm.fits.CohortResult({t.name: made_result() for t in targets}, {}, {})  # noqa: E731
+
+    def fitted(targets, **options):
+        return jm.fits.CohortResult({t.name: made_result() for t in targets}, {}, {})
+
     monkeypatch.setattr(jm, "fit_cohort", fitted, raising=False)
 
     def drawn(figure, folder, name, formats):
@@ -142,7 +178,10 @@ def test_fits_of_many_targets_stay_in_their_folder(tmp_path, monkeypatch):
     assert {path.name for path in out.iterdir() if path.is_dir()} == set(NAMES.values())
     places = {name: str(out / place / "fit.json") for name, place in NAMES.items()}
     assert json.loads(result.stdout.splitlines()[-1])["fits"] == places
-    assert "../../x: cannot be the name of a folder here; its fit is in" in result.stderr and "\x1b" not in result.stderr
+    assert (
+        "../../x: cannot be the name of a folder here; its fit is in" in result.stderr
+        and "\x1b" not in result.stderr
+    )
     assert "Anna: cannot" not in result.stderr
     again = run("fit", *paths, "--out", out)
     refused(again, "is there already; overwrite it with --force")

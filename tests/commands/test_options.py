@@ -1,4 +1,5 @@
-"""Every option of every command with every kind of wrong value: exit code 2, one sentence, before anything is compiled."""
+"""Every option of every command with every kind of wrong value: exit code 2, one sentence, before
+anything is compiled."""
 
 import enum
 import inspect
@@ -15,15 +16,26 @@ from typer.testing import CliRunner
 from jaxmuscle._common import programs
 from jaxmuscle.commands.main import app
 
-COMMANDS: dict[str, Any] = {each.callback.__name__: each.callback for each in app.registered_commands if each.callback}
+COMMANDS: dict[str, Any] = {
+    each.callback.__name__: each.callback for each in app.registered_commands if each.callback
+}
 MADE = typer.main.get_command(app)
 VALID = {
-    "fit": ["t.csv", "--segments", "12"], "simulate": ["zagrodny-slifkin"], "merge": ["none.zarr"], "analyse": ["r.csv"],
-    "ensemble": ["zagrodny-slifkin", "--seeds", "4", "--out", "e.zarr"], "steadiness": ["r.csv"], "compare": ["t.csv"],
-    "posterior": ["t.csv", "--segments", "12"], "design": ["zagrodny-slifkin"], "reproduce": [], "speed": [],
+    "fit": ["t.csv", "--segments", "12"],
+    "simulate": ["zagrodny-slifkin"],
+    "merge": ["none.zarr"],
+    "analyse": ["r.csv"],
+    "ensemble": ["zagrodny-slifkin", "--seeds", "4", "--out", "e.zarr"],
+    "steadiness": ["r.csv"],
+    "compare": ["t.csv"],
+    "posterior": ["t.csv", "--segments", "12"],
+    "design": ["zagrodny-slifkin"],
+    "reproduce": [],
+    "speed": [],
     "identifiability": ["t.csv", "--segments", "12"],
-    "study": ["s.csv"], "explore": ["t.csv", "--no-open", "--out", "e.html"],
-}  # fmt: skip
+    "study": ["s.csv"],
+    "explore": ["t.csv", "--no-open", "--out", "e.html"],
+}
 NUMBERS = ("nan", "inf", "-inf", "1e400", "-1", "9" * 40, "", "text", "1,5", "1e300", "0")
 WHOLE = (*NUMBERS, "1.5", "0x10")
 TEXTS = ("", "text", "..", "\x01", "a\nb")
@@ -31,7 +43,8 @@ PATHS = ("missing.csv", "folder", "..", "r\n.csv", "x\1y.csv")  # no argument ho
 # Zero is one of these; a number below 0 one of the others.
 ZERO = {"seed", "skip_rows", "max_gap", "rungs", "delay", "spread", "process_id", "rung", "alpha"}
 SIGNED = {"delay"}
-LARGE = {"max_gap", "delay", "mvc", "lever_arm", "rms", "peak", "speed", "acceleration"}  # not yet a mistake
+# not yet a mistake
+LARGE = {"max_gap", "delay", "mvc", "lever_arm", "rms", "peak", "speed", "acceleration"}
 FREE = {"output", "force", "as_json"}  # a folder may have any name
 # Known only when the linear response is there, or of no influence where nothing has that name.
 LATER = {("design", "quantity")}
@@ -43,7 +56,8 @@ class Compiled(Exception):
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """A folder with valid files; whoever calls a compiled program other than that of a key fails."""
+    """A folder with valid files; whoever calls a compiled program other than that of a key
+    fails."""
     run = programs.Kept.__call__
 
     def call(self, *arguments, **keywords):
@@ -52,7 +66,8 @@ def here(tmp_path, monkeypatch):
         raise Compiled(self.function.__name__)
 
     monkeypatch.setattr(programs.Kept, "__call__", call)
-    # Typer would build all commands with their options for every call, which takes longer than the call.
+    # Typer would build all commands with their options for every call, which takes longer than the
+    # call.
     monkeypatch.setattr(typer.testing, "_get_command", lambda app: MADE, raising=False)
     monkeypatch.setenv("COLUMNS", "1000")
     monkeypatch.chdir(tmp_path)
@@ -61,7 +76,9 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "t.csv").write_text("frequency_hz,proportional_power\n" + rows)
     force = 5 + 0.1 * np.random.default_rng(0).standard_normal(3000)
     for name in ("r.csv", "r2.csv"):
-        (tmp_path / name).write_text("time_s,force_N\n" + "".join(f"{k / 100},{x}\n" for k, x in enumerate(force)))
+        (tmp_path / name).write_text(
+            "time_s,force_N\n" + "".join(f"{k / 100},{x}\n" for k, x in enumerate(force))
+        )
     (tmp_path / "s.csv").write_text("file,person\nr.csv,a\nr2.csv,b\n")
     (tmp_path / "folder").mkdir()
     before = jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64
@@ -72,7 +89,11 @@ def here(tmp_path, monkeypatch):
 
 def kind_of(parameter: inspect.Parameter) -> Any:
     """The type of an option, without `None` and `list`."""
-    given = typing.get_args(parameter.annotation)[0] if typing.get_args(parameter.annotation) else parameter.annotation
+    given = (
+        typing.get_args(parameter.annotation)[0]
+        if typing.get_args(parameter.annotation)
+        else parameter.annotation
+    )
     options = [kind for kind in typing.get_args(given) if kind is not type(None)] or [given]
     inner = typing.get_args(options[0]) if typing.get_origin(options[0]) is list else ()
     return inner[0] if inner else options[0]
@@ -101,7 +122,9 @@ def cases(command: str) -> list[tuple[str, str, list[str]]]:
                 rest = VALID[command][1:] if command == "ensemble" else []
                 found.append((name, value, [command, *rest, "--", value]))
                 continue
-            declared = [flag for flag in getattr(about, "param_decls", ()) or () if flag.startswith("--")]
+            declared = [
+                flag for flag in getattr(about, "param_decls", ()) or () if flag.startswith("--")
+            ]
             flag = declared[0] if declared else "--" + name.replace("_", "-")
             valid = list(VALID[command])
             if flag in valid:
@@ -122,10 +145,21 @@ def test_a_wrong_value_is_one_sentence(command, here):
             wrong.append(f"--{name} {value!r}: accepted")
         elif not isinstance(result.exception, SystemExit) or result.exit_code != 2:
             wrong.append(f"--{name} {value!r}: exit {result.exit_code}, {result.exception!r}"[:200])
-        elif "Traceback" in result.output or not sentences or ("error:" in result.stderr and len(sentences) > 1):
+        elif (
+            "Traceback" in result.output
+            or not sentences
+            or ("error:" in result.stderr and len(sentences) > 1)
+        ):
             wrong.append(f"--{name} {value!r}: {result.stderr[-200:]!r}")
     assert not wrong, f"{len(wrong)} of {len(cases(command))}:\n" + "\n".join(wrong)
-    assert {path.name for path in here.iterdir()} <= {"t.csv", "r.csv", "r2.csv", "s.csv", "folder", "out"}
+    assert {path.name for path in here.iterdir()} <= {
+        "t.csv",
+        "r.csv",
+        "r2.csv",
+        "s.csv",
+        "folder",
+        "out",
+    }
 
 
 def test_every_command_is_tried():

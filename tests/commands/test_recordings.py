@@ -1,4 +1,5 @@
-"""Commands that take recordings: several trials make one target, spectra and recordings are not mixed."""
+"""Commands that take recordings: several trials make one target, spectra and recordings are not
+mixed."""
 
 import contextlib
 import io
@@ -27,7 +28,9 @@ def run(*arguments):
 def force(seed, seconds=17.0):
     """A held force of 40.5 N whose fluctuation has a corner at 1 Hz."""
     decay = np.exp(-2 * np.pi / RATE)
-    noise = np.random.default_rng(seed).normal(size=round(seconds * RATE) + 2000) * np.sqrt(1 - decay**2)
+    noise = np.random.default_rng(seed).normal(size=round(seconds * RATE) + 2000) * np.sqrt(
+        1 - decay**2
+    )
     x = np.zeros(noise.size)
     for i in range(1, noise.size):
         x[i] = decay * x[i - 1] + noise[i]
@@ -41,10 +44,22 @@ def folder(tmp_path_factory):
     trials = [force(seed) for seed in range(5)]
     time = np.arange(trials[0].size) / RATE
     for number, x in enumerate(trials):
-        np.savetxt(made / f"trial{number}.csv", np.column_stack([time, x]), delimiter=",", header="time,force (N)",
-        comments="", fmt="%.6g")  # fmt: skip
-    np.savetxt(made / "all.csv", np.column_stack([time, *trials[:3]]), delimiter=",", header="time,a (N),b (N),c (N)",
-               comments="", fmt="%.6g")  # fmt: skip
+        np.savetxt(
+            made / f"trial{number}.csv",
+            np.column_stack([time, x]),
+            delimiter=",",
+            header="time,force (N)",
+            comments="",
+            fmt="%.6g",
+        )
+    np.savetxt(
+        made / "all.csv",
+        np.column_stack([time, *trials[:3]]),
+        delimiter=",",
+        header="time,a (N),b (N),c (N)",
+        comments="",
+        fmt="%.6g",
+    )
     (made / "volts.csv").write_text((made / "trial0.csv").read_text().replace("(N)", "(V)"))
     return made
 
@@ -56,17 +71,35 @@ def paths(folder, count=5):
 @pytest.mark.usefixtures("as_fine_as_shipped")
 @pytest.mark.slow
 def test_trials_are_analysed_together(folder, tmp_path):
-    found = run("analyse", *paths(folder), "--out", tmp_path, "--save-target", tmp_path / "anna.toml", "--mvc", 300)
+    found = run(
+        "analyse",
+        *paths(folder),
+        "--out",
+        tmp_path,
+        "--save-target",
+        tmp_path / "anna.toml",
+        "--mvc",
+        300,
+    )
     assert found.exit_code == 0, found.output
     record = json.loads((tmp_path / "analysis.json").read_text())
-    assert [trial["recording"]["name"] for trial in record["trials"]] == [f"trial{n}" for n in range(5)]
+    assert [trial["recording"]["name"] for trial in record["trials"]] == [
+        f"trial{n}" for n in range(5)
+    ]
     means = [trial["summary"]["mean"] for trial in record["trials"]]
     target = jm.load_target(tmp_path / "anna.toml")
     assert target.mean == pytest.approx(means) and len(target.segments) == 5
-    assert list(target.dispersion) == record["dispersion"] and target.mvc_fraction == pytest.approx(np.mean(means) / 300)
-    np.testing.assert_allclose(record["spectrum"]["proportional_power"], target.proportional_power, rtol=1e-9)
+    assert list(target.dispersion) == record["dispersion"] and target.mvc_fraction == pytest.approx(
+        np.mean(means) / 300
+    )
+    np.testing.assert_allclose(
+        record["spectrum"]["proportional_power"], target.proportional_power, rtol=1e-9
+    )
     assert (tmp_path / "analysis.png").stat().st_size > 20_000
-    assert re.search(r"their spectra differ [\d.]+ ± [\d.]+ times as much as by chance", " ".join(found.output.split()))
+    assert re.search(
+        r"their spectra differ [\d.]+ ± [\d.]+ times as much as by chance",
+        " ".join(found.output.split()),
+    )
 
 
 @pytest.mark.slow
@@ -80,8 +113,16 @@ def test_a_column_for_each_trial(folder, tmp_path):
 
 REFUSED = {
     "units": (("trial0.csv", "volts.csv"), (), "units N and V cannot be averaged"),
-    "mixed": (("trial0.csv", "fdi-abduction-45mvc"), (), "They cannot be fitted together: fit one at a time"),
-    "segments": (("trial0.csv", "trial1.csv"), ("--segments", 6), "--segments and --dataset belong to spectra"),
+    "mixed": (
+        ("trial0.csv", "fdi-abduction-45mvc"),
+        (),
+        "They cannot be fitted together: fit one at a time",
+    ),
+    "segments": (
+        ("trial0.csv", "trial1.csv"),
+        ("--segments", 6),
+        "--segments and --dataset belong to spectra",
+    ),
     "groups": (("trial0.csv",), ("--groups", "x.csv"), "--groups compares several spectra"),
     "missing": (("nothing.csv", "trial0.csv"), (), "nothing.csv"),
 }
@@ -115,11 +156,21 @@ def test_a_command_reads_a_file_once(folder, tmp_path, read):
     x, noise = np.random.default_rng(9).standard_normal((2, 4000))
     columns = [np.arange(4000) / RATE, 40 + 0.3 * x + 0.1 * noise, x]
     path = str(tmp_path / "both.csv")
-    np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header="time,force_N,displacement_mm", comments="")
+    np.savetxt(
+        path,
+        np.stack(columns, axis=1),
+        delimiter=",",
+        header="time,force_N,displacement_mm",
+        comments="",
+    )
     for options in ({}, {"displacement": "displacement_mm"}):
         read.clear()
         (found,) = read_recordings([path], reading | options, "2:18", "prescribed-length")
-        assert isinstance(found, jm.PerturbedRecording) and found.window == pytest.approx((2, 18)) and read == [path]
+        assert (
+            isinstance(found, jm.PerturbedRecording)
+            and found.window == pytest.approx((2, 18))
+            and read == [path]
+        )
     read.clear()
     (force,) = read_recordings([path], reading | {"column": "force_N"}, "all", None)
     assert force.unit == "N" and read == [path]
@@ -139,21 +190,34 @@ def test_two_commands_from_raw_trials_to_a_fit(folder, tmp_path):
     # One command does the same.
     assert run("fit", *paths(folder), *options, "--out", tmp_path / "one").exit_code == 0
     again = jm.load_result(tmp_path / "one" / "fit.json")
-    assert again["mean"].value == pytest.approx(mean.value) and again.chi2_per_bin == pytest.approx(result.chi2_per_bin)
+    assert again["mean"].value == pytest.approx(mean.value) and again.chi2_per_bin == pytest.approx(
+        result.chi2_per_bin
+    )
 
 
 def with_angle(path, moves):
-    """A trial as a dynamometer writes it: torque, and the angle of the joint, which moves by so many degrees."""
+    """A trial as a dynamometer writes it: torque, and the angle of the joint, which moves by so
+    many degrees."""
     torque = force(3)
     time = np.arange(torque.size)
     columns = [time / RATE, torque, 30 + moves * np.sqrt(2) * np.sin(time / 5)]
-    np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header="Time (s),Torque (Nm),Position (deg)", comments="")
+    np.savetxt(
+        path,
+        np.stack(columns, axis=1),
+        delimiter=",",
+        header="Time (s),Torque (Nm),Position (deg)",
+        comments="",
+    )
     return str(path)
 
 
 def save_newtons(path, recording):
     np.savetxt(
-        path, np.stack([recording.time, recording.samples], axis=1), delimiter=",", header="time,force_N", comments=""
+        path,
+        np.stack([recording.time, recording.samples], axis=1),
+        delimiter=",",
+        header="time,force_N",
+        comments="",
     )
     return str(path)
 
@@ -167,7 +231,10 @@ def test_a_joint_that_is_held_needs_no_lever_arm(tmp_path):
     assert isinstance(found, jm.Trials) and found[0].unit == "N m"
     assert recordings_of(held) == () and as_target(held).unit == "N m"
     with pytest.raises(
-        ValueError, match=r"held.csv: its column Position .deg. rests .* and that of .*moved.csv moves by 1 deg"
+        ValueError,
+        match=(
+            r"held.csv: its column Position .deg. rests .* and that of .*moved.csv moves by 1 deg"
+        ),
     ):
         read_recordings([moved, held], reading, None, None)
     with contextlib.redirect_stderr(io.StringIO()):
@@ -186,5 +253,7 @@ def test_a_joint_that_is_held_needs_no_lever_arm(tmp_path):
         np.testing.assert_allclose(hold.whole, force.whole, rtol=1e-6)
     reading = {name: default for name, (_, default) in (READING | PERTURBED).items()}
     for paths, task in (([moved], None), ([held], "prescribed-length")):
-        with pytest.raises(ValueError, match="give the distance from the axis to the insertion in m"):
+        with pytest.raises(
+            ValueError, match="give the distance from the axis to the insertion in m"
+        ):
             read_recordings(paths, reading, None, task)

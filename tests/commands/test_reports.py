@@ -1,4 +1,5 @@
-"""report.html: what the commands say in it, in which order, and that names out of files stay words."""
+"""report.html: what the commands say in it, in which order, and that names out of files stay
+words."""
 
 import sys
 from types import SimpleNamespace
@@ -28,7 +29,9 @@ def told(folder):
     seen = Seen((folder / "report.html").read_text(encoding="utf-8"))
     assert not {"script", "iframe", "a", "link"} & {tag for tag, _ in seen.elements}
     assert not [name for _, given in seen.elements for name in given if name.startswith("on")]
-    assert all(given["src"].startswith("data:image/") for _, given in seen.elements if "src" in given)
+    assert all(
+        given["src"].startswith("data:image/") for _, given in seen.elements if "src" in given
+    )
     return " | ".join(word for word in seen.words if word.strip()), seen
 
 
@@ -39,19 +42,33 @@ def test_of_a_fit(tmp_path):
     files = write_fit(result, tmp_path, ["png"], report=True)
     assert files == ["fit.json", "fit.png", "spectrum.csv", "report.html"]
     text, seen = told(tmp_path)
-    assert [text.index(words) for words in ("What the data determine", "What the data do not determine", "What was fixed")] \
-        == sorted(text.index(words) for words in ("What the data determine", "What the data do not determine",
-                                                  "What was fixed"))  # fmt: skip
+    assert [
+        text.index(words)
+        for words in ("What the data determine", "What the data do not determine", "What was fixed")
+    ] == sorted(
+        text.index(words)
+        for words in ("What the data determine", "What the data do not determine", "What was fixed")
+    )
     first, second = text.split("What the data do not determine", 1)
     assert "corner_frequency | 0.333 ± 0.010 | above 0.31 | Hz" in first
-    assert "What to know about this fit" in first and "k_w" not in first.split("What to know about this fit")[0]
+    assert (
+        "What to know about this fit" in first
+        and "k_w" not in first.split("What to know about this fit")[0]
+    )
     assert "k_w" in second and "m_w" in second.split("What was fixed", 1)[1]
-    assert text.count(HOSTILE) >= 4 and "jaxmuscle fit '<script>" in text  # in the shell, too, it is one word
+    # in the shell, too, it is one word
+    assert text.count(HOSTILE) >= 4 and "jaxmuscle fit '<script>" in text
     assert "dt | 0.0025" in text and "jaxmuscle 0.1, jax 0.8" in text
     tried = text.split("Models tried", 1)[1]
-    assert "0 | base | 1.90 | 0.002 | -250.1 | 1 | with activation | 0.90 | 0.3 | -260.0 | the result" in tried
+    assert (
+        "0 | base | 1.90 | 0.002 | -250.1 | 1 | with activation | 0.90 | 0.3 | -260.0 | the result"
+        in tried
+    )
     assert sum(tag == "img" for tag, _ in seen.elements) == 1
-    assert write_fit(result, tmp_path) == ["fit.json", "spectrum.csv"] and not (tmp_path / "report.html").exists()
+    assert (
+        write_fit(result, tmp_path) == ["fit.json", "spectrum.csv"]
+        and not (tmp_path / "report.html").exists()
+    )
 
 
 def test_one_model_alone_was_not_tried_against_others(tmp_path):
@@ -72,12 +89,17 @@ def test_what_to_do_depends_on_the_verdict(case, tmp_path):
     fit_report(result, plt.figure(), tmp_path)
     text, seen = told(tmp_path)
     assert words in text.split("What to do next", 1)[1]
-    assert [given["class"] for tag, given in seen.elements if "verdict" in given.get("class", "")] == [f"verdict {kind}"]
+    assert [
+        given["class"] for tag, given in seen.elements if "verdict" in given.get("class", "")
+    ] == [f"verdict {kind}"]
 
 
 @pytest.mark.slow
 def test_of_a_cohort(tmp_path):
-    results = {HOSTILE: made_result(target=jm.Target(HOSTILE, POWER, segments=[6])), "b": failed_result()}
+    results = {
+        HOSTILE: made_result(target=jm.Target(HOSTILE, POWER, segments=[6])),
+        "b": failed_result(),
+    }
     groups = {HOSTILE: "<b>old</b>", "b": "young"}
     found = jm.fits.CohortResult(results, groups, {"c": f"no file {HOSTILE}"})
     cohort_command._write(found, tmp_path, {HOSTILE: tmp_path / "a", "b": tmp_path / "b"}, ["png"])
@@ -99,8 +121,17 @@ def test_of_a_study(tmp_path):
 
 
 def posterior(success):
-    row = {"median": 1.25, "low": 0.5, "high": 2.0, "r_hat": 1.001, "ess_bulk": 900.0, "ess_tail": 800.0}
-    summary = SimpleNamespace(rows={"k_w": (), "corner_frequency": ()}, units={"k_w": "N/m^3", "corner_frequency": "Hz"})
+    row = {
+        "median": 1.25,
+        "low": 0.5,
+        "high": 2.0,
+        "r_hat": 1.001,
+        "ess_bulk": 900.0,
+        "ess_tail": 800.0,
+    }
+    summary = SimpleNamespace(
+        rows={"k_w": (), "corner_frequency": ()}, units={"k_w": "N/m^3", "corner_frequency": "Hz"}
+    )
 
     class Table(SimpleNamespace):
         def __getitem__(self, name):
@@ -108,21 +139,34 @@ def posterior(success):
 
     target = jm.Target(HOSTILE, POWER, segments=[6])
     return SimpleNamespace(
-        success=success, message="4 chains mixed" if success else "R-hat 1.4", title=HOSTILE, settings={"chains": 4}, seed=1,
-        versions={"jaxmuscle": "0.1"}, determined=("corner_frequency",), parts={"a": SimpleNamespace(target=target)},
+        success=success,
+        message="4 chains mixed" if success else "R-hat 1.4",
+        title=HOSTILE,
+        settings={"chains": 4},
+        seed=1,
+        versions={"jaxmuscle": "0.1"},
+        determined=("corner_frequency",),
+        parts={"a": SimpleNamespace(target=target)},
         summary=lambda: Table(**vars(summary)),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("success", [True, False])
 def test_of_a_posterior(success, tmp_path):
     figure = plt.figure(figsize=(1, 1))
-    posterior_report(posterior(success), {"chains": figure}, tmp_path, {"chains": pixels_of(figure)})
+    posterior_report(
+        posterior(success), {"chains": figure}, tmp_path, {"chains": pixels_of(figure)}
+    )
     text, seen = told(tmp_path)
     assert f"Posterior of {HOSTILE}" in text
     if success:
         first, second = text.split("What the data do not determine")
-        assert "corner_frequency | 1.25 | 0.5 to 2 | Hz | 1.001 | 800" in first and "k_w | 1.25" in second
+        assert (
+            "corner_frequency | 1.25 | 0.5 to 2 | Hz | 1.001 | 800" in first
+            and "k_w | 1.25" in second
+        )
     else:
         assert "Do not use these draws." in text and "corner_frequency |" not in text
-    assert [given["src"][:22] for tag, given in seen.elements if tag == "img"] == ["data:image/png;base64,"]
+    assert [given["src"][:22] for tag, given in seen.elements if tag == "img"] == [
+        "data:image/png;base64,"
+    ]

@@ -1,4 +1,5 @@
-"""Signals end a command soon, with their exit code and no traceback, and what was reached is kept."""
+"""Signals end a command soon, with their exit code and no traceback, and what was reached is
+kept."""
 
 import signal
 import sys
@@ -40,14 +41,18 @@ def ended(process, code):
 ALONE = {
     "between two instructions": ("send(signal.SIGTERM); time.sleep(60)", 143),
     "the terminal is gone": ("send(signal.SIGHUP); time.sleep(60)", 129),
-    "where Python drops exceptions": ("""
+    "where Python drops exceptions": (
+        """
 class Dropped:
     def __del__(self):
         send(signal.SIGINT)
         time.sleep(1)
 Dropped()
-time.sleep(60)""", 130),
-    "a signal that was dropped, and a second one": ("""
+time.sleep(60)""",
+        130,
+    ),
+    "a signal that was dropped, and a second one": (
+        """
 signals.PATIENCE = 0.1
 for _ in range(2):
     try:
@@ -55,38 +60,51 @@ for _ in range(2):
         time.sleep(1)
     except KeyboardInterrupt:
         time.sleep(0.5)
-time.sleep(60)""", 130),
+time.sleep(60)""",
+        130,
+    ),
     "at the end": ("send(signal.SIGTERM); raise ValueError", 143),
-    "a child's, which is not its parent's": ("""
+    "a child's, which is not its parent's": (
+        """
 child = os.fork()
 if child == 0:
     send(signal.SIGTERM)
 assert os.waitpid(child, 0)[1] == signal.SIGTERM
 time.sleep(0.3)
 send(signal.SIGINT)
-time.sleep(60)""", 130),
-    "somebody else's pipe is closed": ("""
+time.sleep(60)""",
+        130,
+    ),
+    "somebody else's pipe is closed": (
+        """
 ours, theirs = socket.socketpair()
 theirs.close()
 try:
     ours.send(b"x")
 except BrokenPipeError:
     send(signal.SIGTERM)
-time.sleep(60)""", 143),
-}  # fmt: skip
+time.sleep(60)""",
+        143,
+    ),
+}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ALONE)
 def test_without_a_command(case):
     text, code = ALONE[case]
-    process = begun("with signals.heard():\n" + "\n".join("    " + line for line in text.splitlines()))
+    process = begun(
+        "with signals.heard():\n" + "\n".join("    " + line for line in text.splitlines())
+    )
     assert "interrupted" in ended(process, code) or case == "at the end"
 
 
 def test_what_is_ignored_on_purpose_stays_so():
     """As with nohup."""
-    code = "signal.signal(signal.SIGHUP, signal.SIG_IGN)\nwith signals.heard(): send(signal.SIGHUP); print('goes on')"
+    code = (
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\nwith signals.heard(): send(signal.SIGHUP);"
+        " print('goes on')"
+    )
     assert "goes on" in ended(begun(code), 0)
 
 
@@ -114,7 +132,9 @@ class Now:
             send(signal.SIGINT)
 sys.meta_path.insert(0, Now())
 main()"""
-    process = begun(code, "fit", "vastus-lateralis-26mvc", "--out", "out", cwd=tmp_path, begin=true_python)
+    process = begun(
+        code, "fit", "vastus-lateralis-26mvc", "--out", "out", cwd=tmp_path, begin=true_python
+    )
     assert ended(process, 130).strip().startswith("interrupted")
     assert not list(tmp_path.rglob("*.*"))
 
@@ -127,7 +147,8 @@ import jax
 signals.LIMIT = 0.5
 with signals.heard():
     signals.stays("nothing was written")
-    program = jax.jit(lambda x: jax.lax.while_loop(lambda x: x < 2, jax.numpy.cos, x)).lower(0.0).compile()
+    endless = jax.jit(lambda x: jax.lax.while_loop(lambda x: x < 2, jax.numpy.cos, x))
+    program = endless.lower(0.0).compile()
     print("begun", flush=True)
     program(0.0).block_until_ready()"""
     process = begun(code)
@@ -171,10 +192,16 @@ def test_an_interrupted_reduction_keeps_every_chunk(tmp_path):
         if len(chunks) == 3:
             raise KeyboardInterrupt
 
-    task, key, options = jm.Isometric(), jax.random.key(5), {"seeds": 40, "duration": 0.2, "chunk": 8}
+    task, key, options = (
+        jm.Isometric(),
+        jax.random.key(5),
+        {"seeds": 40, "duration": 0.2, "chunk": 8},
+    )
     path = tmp_path / "moments.zarr"
     with pytest.raises(KeyboardInterrupt):
-        jm.ensemble(task, key, store=path, reduce=True, progress=jm.ensembles.Watch(stop), **options)
+        jm.ensemble(
+            task, key, store=path, reduce=True, progress=jm.ensembles.Watch(stop), **options
+        )
     kept = read_tallies(place_of(path))
     assert kept is not None and kept.chunks == {0, 1, 2}
     resumed = jm.ensemble(task, key, store=path, reduce=True, resume=True, **options)

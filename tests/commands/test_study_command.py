@@ -1,4 +1,5 @@
-"""`jaxmuscle study`: mistakes in one line, a folder that is not overwritten unasked, what is printed."""
+"""`jaxmuscle study`: mistakes in one line, a folder that is not overwritten unasked, what is
+printed."""
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from jaxmuscle.commands.main import app
 @pytest.fixture
 def table(tmp_path):
     for name in "ab":
-        np.save(tmp_path / f"{name}.npy", 5 + np.random.default_rng(ord(name)).standard_normal(1200))
+        np.save(
+            tmp_path / f"{name}.npy", 5 + np.random.default_rng(ord(name)).standard_normal(1200)
+        )
     path = tmp_path / "study.csv"
     path.write_text("file,person\na.npy,a\nb.npy,b\n")
     return path
@@ -20,7 +23,9 @@ def table(tmp_path):
 
 def command(*arguments):
     result = CliRunner().invoke(app, ["study", *map(str, arguments)], env={"COLUMNS": "300"})
-    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(
+        result.exception
+    )
     return result
 
 
@@ -50,10 +55,29 @@ def test_a_study_is_overwritten_only_with_force(table, tmp_path, monkeypatch):
 
     monkeypatch.setattr(jm, "run_study", run_study)
     out = tmp_path / "out"
-    first = command(table, "--out", out, "--rung", "2", "--window", "1:9", "--quantities", "mean, tremor_share",
-                    "--spectrum", "slow", "--skip-rows", 2, "--time", "clock")  # fmt: skip
+    first = command(
+        table,
+        "--out",
+        out,
+        "--rung",
+        "2",
+        "--window",
+        "1:9",
+        "--quantities",
+        "mean, tremor_share",
+        "--spectrum",
+        "slow",
+        "--skip-rows",
+        2,
+        "--time",
+        "clock",
+    )
     assert first.exit_code == 0, first.stderr
-    assert (asked["rung"], asked["window"], asked["quantities"]) == (2, (1.0, 9.0), ["mean", "tremor_share"])
+    assert (asked["rung"], asked["window"], asked["quantities"]) == (
+        2,
+        (1.0, 9.0),
+        ["mean", "tremor_share"],
+    )
     assert (asked["spectrum"], asked["skip_rows"], asked["time"]) == ("slow", 2, "clock")
     assert not {"max_gap", "axis"} & set(asked)  # of study.toml, if it states them
     assert "Study: 10 people in 2 groups" in first.stdout and "differences.csv" in first.stdout

@@ -23,13 +23,16 @@ def equal(a, b):
 
 
 def test_error_by_coherence_is_that_of_a_regression():
-    """The formula against drawn ordinates F = H X + N: K of them, known H, coherence of the density."""
+    """The formula against drawn ordinates F = H X + N: K of them, known H, coherence of the
+    density."""
     rng, k, h = np.random.default_rng(0), 20, 3 - 2j
     x, n = rng.standard_normal((2, 20_000, k, 2)) @ [1, 1j]
     noise = 4.0
     found = np.sum(x.conj() * (h * x + noise * n), axis=1) / np.sum(np.abs(x) ** 2, axis=1)
     coherence = abs(h) ** 2 / (abs(h) ** 2 + noise**2)
-    stated = jm.FrequencyResponse.from_gain([1.0], [abs(h)], [0.0], coherence=[coherence], segments=k).stderr[0]
+    stated = jm.FrequencyResponse.from_gain(
+        [1.0], [abs(h)], [0.0], coherence=[coherence], segments=k
+    ).stderr[0]
     # Given X the variance is S / Σ|X|², on the average K / (K - 1) times S / (K S_X).
     expected = stated * np.sqrt(k / (k - 1))
     spread = 3.9 / np.sqrt(2 * found.size)
@@ -38,7 +41,9 @@ def test_error_by_coherence_is_that_of_a_regression():
 
 
 def test_gain_phase_and_back():
-    response = jm.FrequencyResponse.from_gain(F, GAIN, PHASE, coherence=COHERENCE, segments=[10, 20, 30, 40], **FIELDS)
+    response = jm.FrequencyResponse.from_gain(
+        F, GAIN, PHASE, coherence=COHERENCE, segments=[10, 20, 30, 40], **FIELDS
+    )
     np.testing.assert_allclose(response.gain, GAIN)
     np.testing.assert_allclose(response.phase, PHASE)
     np.testing.assert_allclose(response.averages, [10, 20, 30, 40])
@@ -47,13 +52,16 @@ def test_gain_phase_and_back():
 
 
 def test_no_coherence_no_error():
-    response = jm.FrequencyResponse.from_gain(F, GAIN, PHASE, coherence=[0.9, 0.9, 0.0, 0.9], segments=10)
+    response = jm.FrequencyResponse.from_gain(
+        F, GAIN, PHASE, coherence=[0.9, 0.9, 0.0, 0.9], segments=10
+    )
     assert np.isinf(response.stderr[2])
     assert np.isfinite(response.stderr[[0, 1, 3]]).all()
 
 
 def test_no_response_is_told_from_a_small_one():
-    """Errors alone are called a response as often as stated, and hardly less; 48 frequencies that add up are one."""
+    """Errors alone are called a response as often as stated, and hardly less; 48 frequencies that
+    add up are one."""
     f, sd, rng = np.linspace(0.5, 12.0, 48), np.linspace(5.0, 20.0, 48), np.random.default_rng(3)
     errors = sd * (rng.standard_normal((2000, 48, 2)) @ [1, 1j])
     p = np.array([jm.FrequencyResponse(f, error, sd).p_none for error in errors])
@@ -63,27 +71,41 @@ def test_no_response_is_told_from_a_small_one():
     # A spring below the error of most points; all of them together know it to a sixth.
     spring = 6 / np.sqrt(np.sum(1 / sd**2))
     assert spring < np.median(sd)
-    assert np.mean([jm.FrequencyResponse(f, error + spring, sd).p_none <= 1e-3 for error in errors[:200]]) > 0.9
-    assert "does not follow the displacement" in str(jm.FrequencyResponse(f, errors[np.argmax(p)], sd))
+    assert (
+        np.mean(
+            [jm.FrequencyResponse(f, error + spring, sd).p_none <= 1e-3 for error in errors[:200]]
+        )
+        > 0.9
+    )
+    assert "does not follow the displacement" in str(
+        jm.FrequencyResponse(f, errors[np.argmax(p)], sd)
+    )
     assert "does not follow" not in str(jm.FrequencyResponse(f, errors[0] + 10 * spring, sd))
     # A point without error counts for nothing.
-    assert jm.FrequencyResponse(f, errors[0], np.where(f < 0.6, np.inf, sd)).p_none == pytest.approx(
-        jm.FrequencyResponse(f[1:], errors[0][1:], sd[1:]).p_none, rel=1e-9
-    )
+    assert jm.FrequencyResponse(
+        f, errors[0], np.where(f < 0.6, np.inf, sd)
+    ).p_none == pytest.approx(jm.FrequencyResponse(f[1:], errors[0][1:], sd[1:]).p_none, rel=1e-9)
 
 
 def test_tables_are_exact():
     for coherence in (COHERENCE, None):
-        response = jm.FrequencyResponse(F, GAIN * np.exp(1j * PHASE), [1.5, np.inf, 0.1, 1 / 3], coherence, **FIELDS)
+        response = jm.FrequencyResponse(
+            F, GAIN * np.exp(1j * PHASE), [1.5, np.inf, 0.1, 1 / 3], coherence, **FIELDS
+        )
         table = response.to_table()
         equal(response, jm.FrequencyResponse.from_table(table))
-        equal(response, jm.FrequencyResponse.from_table(json.loads(json.dumps(table, allow_nan=False))))
+        equal(
+            response,
+            jm.FrequencyResponse.from_table(json.loads(json.dumps(table, allow_nan=False))),
+        )
         equal(response, jm.FrequencyResponse.from_table(tomllib.loads(tomli_w.dumps(table))))
 
 
 def test_saved_and_loaded(tmp_path):
     for coherence in (COHERENCE, None):
-        response = jm.FrequencyResponse.from_gain(F, GAIN, PHASE, coherence=coherence, stderr=[1.5, np.inf, 0.1, 1 / 3])
+        response = jm.FrequencyResponse.from_gain(
+            F, GAIN, PHASE, coherence=coherence, stderr=[1.5, np.inf, 0.1, 1 / 3]
+        )
         response.save(tmp_path / "response.csv")
         again = jm.load_frequency_response(tmp_path / "response.csv")
         np.testing.assert_allclose(again.value, response.value, rtol=1e-14)
@@ -109,8 +131,12 @@ def test_units_in_headers(header, tmp_path):
     scale, turn = HEADERS[header]
     rows = np.c_[F, GAIN * scale, PHASE * turn, COHERENCE]
     path = tmp_path / "figure.csv"
-    path.write_text(f"# Smith 1999\n{header}\n" + "\n".join(",".join(map(repr, row)) for row in rows.tolist()))
-    found = jm.load_frequency_response(path, segments=12, lever_arm=0.04 if "Nm" in header or "·" in header else None)
+    path.write_text(
+        f"# Smith 1999\n{header}\n" + "\n".join(",".join(map(repr, row)) for row in rows.tolist())
+    )
+    found = jm.load_frequency_response(
+        path, segments=12, lever_arm=0.04 if "Nm" in header or "·" in header else None
+    )
     wanted = jm.FrequencyResponse.from_gain(F, GAIN, PHASE, coherence=COHERENCE, segments=12)
     np.testing.assert_allclose(found.value, wanted.value, rtol=1e-12)
     np.testing.assert_allclose(found.stderr, wanted.stderr, rtol=1e-12)
@@ -128,7 +154,9 @@ def test_decibel_and_errors_in_the_unit_of_the_gain(tmp_path):
 
 def test_a_table_that_a_fit_wrote_is_read_without_what_was_fitted(tmp_path):
     path = tmp_path / "stiffness.csv"
-    path.write_text("frequency_hz,real,imaginary,stderr,fitted_real,fitted_imaginary\n1,100,-20,3,90,1\n2,80,5,inf,90,1\n")
+    path.write_text(
+        "frequency_hz,real,imaginary,stderr,fitted_real,fitted_imaginary\n1,100,-20,3,90,1\n2,80,5,inf,90,1\n"
+    )
     found = jm.load_frequency_response(path, name="own")
     np.testing.assert_allclose(found.value, [100 - 20j, 80 + 5j], rtol=1e-12)
     np.testing.assert_array_equal(found.stderr, [3, np.inf])
@@ -137,9 +165,15 @@ def test_a_table_that_a_fit_wrote_is_read_without_what_was_fitted(tmp_path):
 
 @pytest.mark.parametrize("spectrum", [False, True])
 def test_a_target_with_a_stiffness_is_saved_and_read_back_equal(spectrum, tmp_path):
-    """Also one that has a stiffness and no spectrum, whose frequencies and powers are empty lists."""
-    measured = jm.FrequencyResponse(F, GAIN * np.exp(1j * np.radians(PHASE)), [3.0, 4.0, np.inf, 5.0], coherence=COHERENCE,
-                                    **FIELDS)  # fmt: skip
+    """Also one that has a stiffness and no spectrum, whose frequencies and powers are empty
+    lists."""
+    measured = jm.FrequencyResponse(
+        F,
+        GAIN * np.exp(1j * np.radians(PHASE)),
+        [3.0, 4.0, np.inf, 5.0],
+        coherence=COHERENCE,
+        **FIELDS,
+    )
     power = np.arange(1.0, 31) if spectrum else None
     target = jm.Target("anna", power, segments=12 if spectrum else None, stiffness=measured)
     target.save(tmp_path / "anna.toml")
@@ -147,20 +181,35 @@ def test_a_target_with_a_stiffness_is_saved_and_read_back_equal(spectrum, tmp_pa
     np.testing.assert_array_equal(found.bins, target.bins)
     np.testing.assert_array_equal(found.proportional_power, target.proportional_power)
     equal(found.stiffness, measured)
-    assert (found.name, found.segments, found.settings) == (target.name, target.segments, target.settings)
+    assert (found.name, found.segments, found.settings) == (
+        target.name,
+        target.segments,
+        target.settings,
+    )
 
 
 def test_a_mean_without_a_spectrum_is_known_to_two_percent():
-    """Its density at low frequencies is not known: the error is that of a target without segments."""
+    """Its density at low frequencies is not known: the error is that of a target without
+    segments."""
     measured = jm.FrequencyResponse(F, GAIN, 5.0 * np.ones(4))
     stated = {"mean": 20.0, "unit": "N", "stiffness": measured}
     with_all = jm.Target("anna", None, segments=12, coefficient_of_variation=0.02, **stated)
-    assert with_all.mean_force == jm.Target("anna", None, **stated).mean_force == pytest.approx((20.0, 0.4))
+    assert (
+        with_all.mean_force
+        == jm.Target("anna", None, **stated).mean_force
+        == pytest.approx((20.0, 0.4))
+    )
 
 
 def test_a_target_without_spectrum_needs_a_stiffness(tmp_path):
-    table = {"name": "a", "quantity": "force", "provenance": "user", "source": "b", "frequency_hz": [],
-             "proportional_power": []}  # fmt: skip
+    table = {
+        "name": "a",
+        "quantity": "force",
+        "provenance": "user",
+        "source": "b",
+        "frequency_hz": [],
+        "proportional_power": [],
+    }
     (tmp_path / "a.toml").write_text(tomli_w.dumps(table))
     with pytest.raises(ValueError, match="frequency_hz must be a list of numbers"):
         jm.load_target(tmp_path / "a.toml")
@@ -177,15 +226,30 @@ DAMAGED = {
     "short line": (HEAD + "1,2,3,0.9\n2,2,3\n3,2,3,0.9\n", "line 3: 3 of 4 columns found"),
     "unsorted": ("# a\n" + HEAD + "2,2,3,0.9\n1,2,3,0.9\n", "line 4: frequency 1 Hz does not rise"),
     "coherence above 1": (HEAD + "1,2,3,0.9\n2,2,3,90\n", "coherence, line 3: 90"),
-    "coherence of 1": (HEAD + "1,2,3,1\n2,2,3,0.9\n", "coherence, line 2: 1: the formula has no error"),
+    "coherence of 1": (
+        HEAD + "1,2,3,1\n2,2,3,0.9\n",
+        "coherence, line 2: 1: the formula has no error",
+    ),
     "gain below 0": (HEAD + "1,2,3,0.9\n2,-2,3,0.9\n", "gain, line 3: -2"),
     "frequency 0": (HEAD + "0,2,3,0.9\n2,2,3,0.9\n", "frequency, line 2: 0"),
-    "unknown column": ("frequency_hz,gain,phase,power\n1,2,3,4\n2,2,3,4\n", "unknown column 'power'"),
+    "unknown column": (
+        "frequency_hz,gain,phase,power\n1,2,3,4\n2,2,3,4\n",
+        "unknown column 'power'",
+    ),
     "unknown unit": ("frequency_hz,gain_lb/in,phase\n1,2,3\n2,2,3\n", "unknown unit 'lb/in'"),
     "no phase": ("frequency_hz,gain,coherence\n1,2,0.3\n2,2,0.3\n", "no column 'phase'"),
-    "twice": ("frequency_hz,gain,phase,gain_N/mm\n1,2,3,4\n2,2,3,4\n", "are both the gain; keep one"),
-    "lever arm": ("frequency_hz,gain_Nm/rad,phase,coherence\n1,2,3,0.4\n2,2,3,0.4\n", "give the lever arm in m"),
-    "no error": ("frequency_hz,gain,phase\n1,2,3\n2,2,3\n", "stderr: is not known; give it, or the coherence"),
+    "twice": (
+        "frequency_hz,gain,phase,gain_N/mm\n1,2,3,4\n2,2,3,4\n",
+        "are both the gain; keep one",
+    ),
+    "lever arm": (
+        "frequency_hz,gain_Nm/rad,phase,coherence\n1,2,3,0.4\n2,2,3,0.4\n",
+        "give the lever arm in m",
+    ),
+    "no error": (
+        "frequency_hz,gain,phase\n1,2,3\n2,2,3\n",
+        "stderr: is not known; give it, or the coherence",
+    ),
     "empty": ("", "is empty"),
 }
 

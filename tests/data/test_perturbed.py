@@ -1,4 +1,5 @@
-"""Recordings of force and displacement: the response and its errors, sign, delay, units, files, what is refused."""
+"""Recordings of force and displacement: the response and its errors, sign, delay, units, files,
+what is refused."""
 
 import json
 import re
@@ -20,7 +21,8 @@ RATE, SECONDS, SEEDS = 100.0, 60.0, 40
 K, B, INERTIA = 1500.0, 25.0, 0.3
 MEAN, DISPLACED, AR = 50.0, 1e-3, 0.95
 CHANCE = 3.9  # standard errors that one draw in 10 000 exceeds
-FINE = jm.SpectrumSettings(length=512, last_bin=50, filter_direction="both")  # resolves how the response bends
+# resolves how the response bends
+FINE = jm.SpectrumSettings(length=512, last_bin=50, filter_direction="both")
 
 
 def stiffness(f):
@@ -29,9 +31,11 @@ def stiffness(f):
 
 
 def spring_damper_mass(band=5.0, rate=RATE):
-    """Filters from white noise to displacement and to force, by the exact step of x, x', x'', x''' (scipy, no jaxmuscle).
+    """Filters from white noise to displacement and to force, by the exact step of x, x', x'', x'''
+    (scipy, no jaxmuscle).
 
-    The displacement is white noise, held for a sample, through an analog Butterworth filter of fourth order.
+    The displacement is white noise, held for a sample, through an analog Butterworth filter of
+    fourth order.
     """
     b, a = scipy.signal.butter(4, 2 * np.pi * band, analog=True)
     a_matrix = np.eye(4, k=1)
@@ -44,14 +48,21 @@ def spring_damper_mass(band=5.0, rate=RATE):
 
 
 def drawn(seeds, noise, rate=RATE, seed=0):
-    """Displacement [m] and force [N] of some seeds, and the filters; the force has noise of density 2 noise² / rate |A|²."""
+    """Displacement [m] and force [N] of some seeds, and the filters; the force has noise of density
+    2 noise² / rate |A|²."""
     rng = np.random.default_rng(seed)
     x, force, poles = spring_damper_mass(rate=rate)
     scale = DISPLACED / np.sqrt(np.sum(scipy.signal.lfilter(x, poles, np.eye(1, 20_000)[0]) ** 2))
     kept = round(SECONDS * rate)
     white = rng.standard_normal((2, seeds, kept + round(5 * rate)))
-    moved, pulled = (scale * scipy.signal.lfilter(f, poles, white[0])[:, -kept:] for f in (x, force))
-    return moved, pulled + MEAN + scipy.signal.lfilter([noise], [1, -AR], white[1])[:, -kept:], (scale * x, poles)
+    moved, pulled = (
+        scale * scipy.signal.lfilter(f, poles, white[0])[:, -kept:] for f in (x, force)
+    )
+    return (
+        moved,
+        pulled + MEAN + scipy.signal.lfilter([noise], [1, -AR], white[1])[:, -kept:],
+        (scale * x, poles),
+    )
 
 
 def recorded(displacement, force, rate=RATE, **options):
@@ -77,7 +88,9 @@ def test_response_equals_scipy():
     cross = scipy.signal.csd(moved[0], force[0], **options)[1][bins]
     power = scipy.signal.welch(moved[0], **options)[1][bins]
     np.testing.assert_allclose(found.value, cross / power, rtol=1e-10)
-    np.testing.assert_allclose(found.coherence, scipy.signal.coherence(moved[0], force[0], **options)[1][bins], rtol=1e-10)
+    np.testing.assert_allclose(
+        found.coherence, scipy.signal.coherence(moved[0], force[0], **options)[1][bins], rtol=1e-10
+    )
 
 
 def test_several_tapers_are_added_up():
@@ -86,16 +99,23 @@ def test_several_tapers_are_added_up():
     found = recorded(moved[0], force[0]).frequency_response(settings)
     tapers = scipy.signal.windows.dpss(1000, 2, 3)
     bins = np.rint(found.frequency / settings.resolution).astype(int)
-    cross, power = (sum(scipy.signal.csd(moved[0], y, RATE, taper, 1000, 500, detrend="linear")[1][bins] for taper in tapers)
-                    for y in (force[0], moved[0]))  # fmt: skip
+    cross, power = (
+        sum(
+            scipy.signal.csd(moved[0], y, RATE, taper, 1000, 500, detrend="linear")[1][bins]
+            for taper in tapers
+        )
+        for y in (force[0], moved[0])
+    )
     np.testing.assert_allclose(found.value, cross / power, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_errors_of_few_segments_are_not_too_small():
-    """Of four segments the response takes up one; without that the stated variance would be a quarter too small."""
+    """Of four segments the response takes up one; without that the stated variance would be a
+    quarter too small."""
     x, noise = np.random.default_rng(4).standard_normal((2, 250, 640))
-    found = [response_of(*pair, jm.SpectrumSettings()) for pair in zip(x, noise, strict=True)]  # the response is 0
+    # the response is 0
+    found = [response_of(*pair, jm.SpectrumSettings()) for pair in zip(x, noise, strict=True)]
     seen = np.array([np.mean(np.abs(r.value) ** 2) for r in found])
     stated = np.array([np.mean(2 * r.stderr**2) for r in found])
     spread = np.std(seen / seen.mean() - stated / stated.mean()) / np.sqrt(len(found))
@@ -110,7 +130,8 @@ def test_one_standard_error_covers_what_it_should(responses):
     averages = FINE.degrees_of_freedom(FINE.segments(round(SECONDS * RATE))) / 2
     expected = scipy.stats.t.cdf(1, 2 * (averages - 1)) - scipy.stats.t.cdf(-1, 2 * (averages - 1))
     binomial = np.sqrt(expected * (1 - expected) / within.size)
-    shared = 1.3  # neighbouring bins are correlated by 0.45, so whether they are covered by less than 0.45² = 0.2
+    # neighbouring bins are correlated by 0.45, so whether they are covered by less than 0.45² = 0.2
+    shared = 1.3
     assert abs(within.mean() - expected) < CHANCE * binomial * shared
 
 
@@ -120,7 +141,8 @@ def test_neighbouring_bins_share_errors_as_stated(responses):
     seen = np.mean(np.real(error[:, 1:] * error[:, :-1].conj())) / 2
     stated = np.mean([np.real(np.diag(r.correlation, 1)[: bins - 1]) for r in found])
     assert stated == pytest.approx(0.45, abs=0.05)
-    assert seen == pytest.approx(stated, abs=CHANCE * 1.5 / np.sqrt(error.size))  # E|e|⁴ = 2 (E|e|²)²: 0.7 to 1.5 a pair
+    # E|e|⁴ = 2 (E|e|²)²: 0.7 to 1.5 a pair
+    assert seen == pytest.approx(stated, abs=CHANCE * 1.5 / np.sqrt(error.size))
 
 
 def test_coherence_is_that_of_theory(responses):
@@ -133,7 +155,8 @@ def test_coherence_is_that_of_theory(responses):
     truth = follows / (follows + noise)
     averages = FINE.degrees_of_freedom(FINE.segments(round(SECONDS * RATE))) / 2
     seen = np.array([r.coherence[:bins] for r in found])
-    expected = truth + (1 - truth) ** 2 / averages  # Bendat & Piersol 2010, section 9.2: the bias, and the spread below
+    # Bendat & Piersol 2010, section 9.2: the bias, and the spread below
+    expected = truth + (1 - truth) ** 2 / averages
     spread = np.sqrt(2 * truth) * (1 - truth) / np.sqrt(averages)
     offset = (seen.mean(0) - expected) / (spread / np.sqrt(SEEDS))
     assert np.all(np.abs(offset) < 4.8)  # 50 bins, one draw in 10 000
@@ -141,7 +164,8 @@ def test_coherence_is_that_of_theory(responses):
 
 
 def test_periodic_input_has_honest_errors():
-    """A multisine whose period is a segment: overlapping segments repeat the input, and so are worth less."""
+    """A multisine whose period is a segment: overlapping segments repeat the input, and so are
+    worth less."""
     settings = jm.SpectrumSettings(window="boxcar", filter_cutoff=None)
     tones, time = np.arange(1, 25), np.arange(6000) / RATE
     f = tones * settings.resolution
@@ -149,8 +173,15 @@ def test_periodic_input_has_honest_errors():
     phases = np.exp(2j * np.pi * (f[:, None] * time + rng.uniform(size=(24, 1))))
     x, force = phases.real.sum(0), (stiffness(f)[:, None] * phases).real.sum(0)
     noise = scipy.signal.lfilter([300], [1, -AR], rng.standard_normal((60, 6500)))[:, 500:]
-    error = np.array([((r := response_of(x, force + n, settings)).value - stiffness(f)) / r.stderr for n in noise])
-    assert np.mean(np.abs(error) ** 2) / 2 == pytest.approx(1, abs=CHANCE * 1.5 / np.sqrt(error.size) + 0.03)
+    error = np.array(
+        [
+            ((r := response_of(x, force + n, settings)).value - stiffness(f)) / r.stderr
+            for n in noise
+        ]
+    )
+    assert np.mean(np.abs(error) ** 2) / 2 == pytest.approx(
+        1, abs=CHANCE * 1.5 / np.sqrt(error.size) + 0.03
+    )
 
 
 def test_second_order_and_its_errors(responses):
@@ -167,25 +198,34 @@ def test_second_order_and_its_errors(responses):
 
 
 def test_second_order_at_the_edges_of_the_input():
-    """A multisine that ends between two bins: what an outer bin sees lies beside its middle. The exact limb is found."""
+    """A multisine that ends between two bins: what an outer bin sees lies beside its middle. The
+    exact limb is found."""
     rate, seconds = 200, 60
     f = np.arange(1, rate * seconds // 2) / seconds
     inside = (f >= 0.5) & (f <= 5.0)
     phase = np.exp(2j * np.pi * np.random.default_rng(8).uniform(size=f.size))
     tones = np.concatenate([[0], np.where(inside, phase, 0), [0]])
     s = np.concatenate([[0], 2j * np.pi * f, [0]])
-    x, force = (np.fft.irfft(tones * gain, rate * seconds) for gain in (1.0, K + B * s + INERTIA * s**2))
+    x, force = (
+        np.fft.irfft(tones * gain, rate * seconds) for gain in (1.0, K + B * s + INERTIA * s**2)
+    )
     scale = 1e-3 / np.std(x)
     noise = 1e-3 * np.random.default_rng(9).standard_normal(x.size)
     moved, pulled = (np.tile(part, 2) for part in (scale * x, scale * force + noise))
-    record = recorded(moved, 10.0 + pulled, float(rate), positive="lengthening", window=(30.0, 90.0))
+    record = recorded(
+        moved, 10.0 + pulled, float(rate), positive="lengthening", window=(30.0, 90.0)
+    )
     found = record.second_order()
     for name, true in (("K", K), ("B", B), ("I", INERTIA)):
         assert found[name].value == pytest.approx(true, rel=0.03), name
-    response = response_of(record.displacement.filtered(jm.SpectrumSettings()), record.force.filtered(jm.SpectrumSettings()),
-                           jm.SpectrumSettings())  # fmt: skip
+    response = response_of(
+        record.displacement.filtered(jm.SpectrumSettings()),
+        record.force.filtered(jm.SpectrumSettings()),
+        jm.SpectrumSettings(),
+    )
     middle = (response.frequency > 1.5) & (response.frequency < 4.2)
-    np.testing.assert_allclose(response.centre[middle], response.frequency[middle], atol=0.12)  # of a bin of 0.39 Hz
+    # of a bin of 0.39 Hz
+    np.testing.assert_allclose(response.centre[middle], response.frequency[middle], atol=0.12)
     beyond = response.centre[(response.frequency > 5.0) & (response.frequency < 5.6)]
     assert np.all((beyond > 4.5) & (beyond < 5.0))  # nothing moves above 5 Hz
 
@@ -196,7 +236,9 @@ def test_two_parts_in_series_are_not_of_second_order():
     s = 2j * np.pi * f
     inner, outer = 0.5 * s**2 + 60 * s + 200, 5 * s + 200
     exact = inner * outer / (inner + outer) + 0.5 * s**2
-    response = Response(f, exact, 0.02 * np.abs(exact), np.ones(f.size), np.eye(f.size) + 0j, np.ones(f.size), f)
+    response = Response(
+        f, exact, 0.02 * np.abs(exact), np.ones(f.size), np.eye(f.size) + 0j, np.ones(f.size), f
+    )
     fit = second_order_fit(response, True)
     assert f"{fit.value[0]:.0f} {fit.stderr[0]:.0f}" == "144 4"
     assert f"{1e3 * fit.value[3]:.1f} {1e3 * fit.stderr[3]:.1f}" == "-1.2 0.4"
@@ -216,9 +258,14 @@ def test_a_delay_is_found_and_taken_out():
     assert abs(back) < CHANCE * error
     assert any("lags by 8 ms" in notice for notice in whole.notices)
     (said,) = late.late(FINE)
-    assert re.match(r"the force comes [78]\.?\d* ± \S+ ms late, beyond what a spring", said) and not whole.late(FINE)
+    assert re.match(
+        r"the force comes [78]\.?\d* ± \S+ ms late, beyond what a spring", said
+    ) and not whole.late(FINE)
     early = recorded(moved[0, :-8], force[0, 8:], 1000.0)
-    assert "ms early" in early.late(FINE)[0] and not recorded(moved[0, :300], force[0, :300], 1000.0).late()
+    assert (
+        "ms early" in early.late(FINE)[0]
+        and not recorded(moved[0, :300], force[0, :300], 1000.0).late()
+    )
 
 
 def test_part_of_a_sample_is_taken_out():
@@ -228,18 +275,28 @@ def test_part_of_a_sample_is_taken_out():
         shifted = recorded(x, force, 200.0, delay=delay, positive="lengthening").displacement
         at = shifted.start + np.arange(shifted.whole.size) / 200 - delay
         inner = slice(20, -20)
-        np.testing.assert_allclose(shifted.whole[inner], np.sin(2 * np.pi * 3 * at)[inner], atol=1e-6)
+        np.testing.assert_allclose(
+            shifted.whole[inner], np.sin(2 * np.pi * 3 * at)[inner], atol=1e-6
+        )
 
 
-@pytest.mark.parametrize(("seconds", "settings"), [(30, "standard"), (30, "slow"), (20, "standard")])
+@pytest.mark.parametrize(
+    ("seconds", "settings"), [(30, "standard"), (30, "slow"), (20, "standard")]
+)
 def test_unrelated_channels_have_no_response(seconds, settings):
-    """Few averages and overlapping segments: of 40 pairs 2 are expected below 0.05, 9 hardly ever (p = 2e-4)."""
+    """Few averages and overlapping segments: of 40 pairs 2 are expected below 0.05, 9 hardly ever
+    (p = 2e-4)."""
     count = round(seconds * RATE)
     moved, force, _ = drawn(40, 0.2)
-    found = [recorded(x[:count], y[-count:], positive="lengthening").frequency_response(settings).p_none
-             for x, y in zip(moved, force[::-1], strict=True)]  # fmt: skip
+    found = [
+        recorded(x[:count], y[-count:], positive="lengthening").frequency_response(settings).p_none
+        for x, y in zip(moved, force[::-1], strict=True)
+    ]
     assert min(found) > 1e-3 and np.sum(np.array(found) < 0.05) < 9 and np.median(found) > 0.15
-    related = [recorded(x[:count], y[:count]).frequency_response(settings).p_none for x, y in zip(moved, force, strict=True)]
+    related = [
+        recorded(x[:count], y[:count]).frequency_response(settings).p_none
+        for x, y in zip(moved, force, strict=True)
+    ]
     assert max(related) <= 1e-3
 
 
@@ -248,10 +305,17 @@ def test_sign():
     straight, turned = recorded(moved[0], force[0]), recorded(-moved[0], force[0])
     np.testing.assert_array_equal(straight.displacement.whole, turned.displacement.whole)
     assert not straight.notices
-    assert any("counts shortening as positive: its sign is turned" in notice for notice in turned.notices)
-    np.testing.assert_array_equal(recorded(moved[0], force[0], positive="shortening").displacement.whole, -moved[0])
-    np.testing.assert_array_equal(recorded(-moved[0], force[0], positive="lengthening").displacement.whole, -moved[0])
-    heavy = force[0] + (7.5 - INERTIA) * np.gradient(np.gradient(moved[0], 1 / RATE), 1 / RATE)  # above 2.3 Hz a mass
+    assert any(
+        "counts shortening as positive: its sign is turned" in notice for notice in turned.notices
+    )
+    np.testing.assert_array_equal(
+        recorded(moved[0], force[0], positive="shortening").displacement.whole, -moved[0]
+    )
+    np.testing.assert_array_equal(
+        recorded(-moved[0], force[0], positive="lengthening").displacement.whole, -moved[0]
+    )
+    # above 2.3 Hz a mass
+    heavy = force[0] + (7.5 - INERTIA) * np.gradient(np.gradient(moved[0], 1 / RATE), 1 / RATE)
     np.testing.assert_array_equal(recorded(moved[0], heavy).displacement.whole, moved[0])
     (pushed,) = recorded(moved[0], -force[0]).notices
     assert "mean force is negative" in pushed and "It will not be once the force is right" in pushed
@@ -261,7 +325,9 @@ def test_sign():
         (size,) = recorded(factor * moved[0], force[0] / factor).notices
         assert size.endswith(f"give --displacement-units {unit} (Python: displacement_units=)")
     unrelated = recorded(moved[0], force[0, ::-1])
-    assert any("--positive lengthening or --positive shortening" in notice for notice in unrelated.notices)
+    assert any(
+        "--positive lengthening or --positive shortening" in notice for notice in unrelated.notices
+    )
     short = recorded(moved[0, :300], force[0, :300])
     assert any("sign of the displacement is not checked" in notice for notice in short.notices)
     with pytest.raises(ValueError, match="positive='up'"):
@@ -271,7 +337,9 @@ def test_sign():
 def test_steady_part_and_window():
     moved, force, _ = drawn(1, 0.2)
     ramp = np.linspace(0, MEAN, 300)
-    whole = recorded(np.concatenate([0 * ramp, moved[0], 0 * ramp]), np.concatenate([ramp, force[0], ramp[::-1]]))
+    whole = recorded(
+        np.concatenate([0 * ramp, moved[0], 0 * ramp]), np.concatenate([ramp, force[0], ramp[::-1]])
+    )
     held = whole.steady()
     assert held.window is not None
     assert held.window == held.displacement.window
@@ -282,7 +350,9 @@ def test_steady_part_and_window():
     f = given.frequency_response()
     assert f.source.endswith("window 10 s to 40 s")
     np.testing.assert_allclose(np.abs(f.value - stiffness(f.frequency)) / f.stderr, 0, atol=6)
-    with pytest.raises(ValueError, match=r"a frequency response needs 512 at 100 Hz, 5\.12 s; give a longer window"):
+    with pytest.raises(
+        ValueError, match=r"a frequency response needs 512 at 100 Hz, 5\.12 s; give a longer window"
+    ):
         whole.steady((10, 14)).frequency_response()
 
 
@@ -290,14 +360,18 @@ def test_the_hold_of_a_weak_force_that_answers_with_half_of_itself():
     moved, force, _ = drawn(1, 0.05)
     weak, still = 3.0, 0 * np.linspace(0, 1, 300)
     ramp = np.linspace(0, weak, 300)
-    whole = recorded(np.concatenate([still, moved[0], still]), np.concatenate([ramp, force[0] - MEAN + weak, ramp[::-1]]))
+    whole = recorded(
+        np.concatenate([still, moved[0], still]),
+        np.concatenate([ramp, force[0] - MEAN + weak, ramp[::-1]]),
+    )
     assert np.std(force[0]) > 0.3 * weak
     with pytest.raises(ValueError, match="no steady part was found"):
         whole.force.steady()
     held = whole.steady()
     assert held.window is not None and held.window == held.displacement.window
     assert 3 <= held.window[0] < 5 < 61 < held.window[1] <= 63
-    np.testing.assert_array_equal(held.force.whole, whole.force.whole)  # only looked for without the answer
+    # only looked for without the answer
+    np.testing.assert_array_equal(held.force.whole, whole.force.whole)
     assert sum("steady part" in notice for notice in held.notices) == 1
 
 
@@ -320,16 +394,34 @@ def test_units(case, header, tmp_path):
     x, force = 1e-3 * np.sin(2 * np.pi * time), 50 + 2 * np.sin(2 * np.pi * time)
     names = f"time,pull [{units}],way [{moved_units}]" if header else "time,pull,way"
     path = tmp_path / "perturbed.csv"
-    np.savetxt(path, np.c_[time, force * scale, x * reach], delimiter=",", header=names, comments="", fmt="%.15g")
+    np.savetxt(
+        path,
+        np.c_[time, force * scale, x * reach],
+        delimiter=",",
+        header=names,
+        comments="",
+        fmt="%.15g",
+    )
     stated = {} if header else {"units": units, "displacement_units": moved_units}
     found = jm.load_recording(path, force="pull", displacement="way", lever_arm=arm, **stated)
     np.testing.assert_allclose(found.force.whole, force, rtol=1e-12)
     np.testing.assert_allclose(found.displacement.whole, x, atol=1e-15)
-    assert (found.force.unit, found.displacement.unit, found.rate, found.name) == ("N", "m", 100.0, "perturbed")
+    assert (found.force.unit, found.displacement.unit, found.rate, found.name) == (
+        "N",
+        "m",
+        100.0,
+        "perturbed",
+    )
 
 
 def save(path, **columns):
-    np.savetxt(path, np.stack(list(columns.values()), axis=1), delimiter=",", header=",".join(columns), comments="")
+    np.savetxt(
+        path,
+        np.stack(list(columns.values()), axis=1),
+        delimiter=",",
+        header=",".join(columns),
+        comments="",
+    )
     return path
 
 
@@ -337,20 +429,43 @@ def save(path, **columns):
 def file(tmp_path_factory):
     moved, force, _ = drawn(1, 0.2)
     path = tmp_path_factory.mktemp("perturbed") / "perturbed.csv"
-    return save(path, time=np.arange(6000) / 100, force_N=force[0], displacement_mm=1e3 * moved[0], angle_deg=moved[0],
-                plain=moved[0], still_mm=0 * moved[0])  # fmt: skip
+    return save(
+        path,
+        time=np.arange(6000) / 100,
+        force_N=force[0],
+        displacement_mm=1e3 * moved[0],
+        angle_deg=moved[0],
+        plain=moved[0],
+        still_mm=0 * moved[0],
+    )
 
 
 def test_every_format_with_columns(file, tmp_path):
     wanted = jm.load_recording(file, force="force_N", displacement="displacement_mm")
-    columns = dict(zip(("force", "displacement"), (wanted.force.whole, 1e3 * wanted.displacement.whole), strict=True))
+    columns = dict(
+        zip(
+            ("force", "displacement"),
+            (wanted.force.whole, 1e3 * wanted.displacement.whole),
+            strict=True,
+        )
+    )
     np.savez(tmp_path / "a.npz", fs=100.0, **columns)
     np.save(tmp_path / "a.npy", np.stack(list(columns.values()), axis=1))
-    for name, (force, displacement), options in (("a.npz", columns, {}), ("a.npy", (0, 1), {"rate": 100})):
+    for name, (force, displacement), options in (
+        ("a.npz", columns, {}),
+        ("a.npy", (0, 1), {"rate": 100}),
+    ):
         found = jm.load_recording(
-            tmp_path / name, force=force, displacement=displacement, units="N", displacement_units="mm", **options
+            tmp_path / name,
+            force=force,
+            displacement=displacement,
+            units="N",
+            displacement_units="mm",
+            **options,
         )
-        np.testing.assert_allclose(found.displacement.whole, wanted.displacement.whole, rtol=1e-12, atol=1e-18)
+        np.testing.assert_allclose(
+            found.displacement.whole, wanted.displacement.whole, rtol=1e-12, atol=1e-18
+        )
         np.testing.assert_array_equal(found.force.whole, wanted.force.whole)
 
 
@@ -358,7 +473,9 @@ def test_gaps_are_closed_in_both(tmp_path):
     moved, force, _ = drawn(1, 0.2)
     holes = force[0].copy()
     holes[:4], holes[100:103] = np.nan, np.nan
-    path = save(tmp_path / "a.csv", time=np.arange(6000) / 100, force_N=holes, way_mm=1e3 * moved[0])
+    path = save(
+        tmp_path / "a.csv", time=np.arange(6000) / 100, force_N=holes, way_mm=1e3 * moved[0]
+    )
     found = jm.load_recording(path, force="force", displacement="way")
     assert found.force.whole.size == found.displacement.whole.size == 5996
     assert found.displacement.start == 0.04
@@ -368,21 +485,52 @@ def test_gaps_are_closed_in_both(tmp_path):
 REFUSED = {
     "only one": ({"force": "force_N"}, "give `force` and `displacement`"),
     "no such column": ({"force": "force_N", "displacement": "way"}, "no displacement 'way'"),
-    "the time": ({"force": "force_N", "displacement": "time"}, "displacement='time' is the time; choose one of"),
+    "the time": (
+        {"force": "force_N", "displacement": "time"},
+        "displacement='time' is the time; choose one of",
+    ),
     "twice the same": ({"force": "force_N", "displacement": "force_N"}, "are one column"),
-    "lever arm missing": ({"force": "force_N", "displacement": "angle_deg"}, "in m, as lever_arm=0.1"),
+    "lever arm missing": (
+        {"force": "force_N", "displacement": "angle_deg"},
+        "in m, as lever_arm=0.1",
+    ),
     "lever arm of nothing": (
-        {"force": "force_N", "displacement": "displacement_mm", "lever_arm": 0.1}, "lever_arm=0.1: leave it out"),
-    "no unit": ({"force": "force_N", "displacement": "plain"}, "give `displacement_units`, as displacement_units='mm'"),
+        {"force": "force_N", "displacement": "displacement_mm", "lever_arm": 0.1},
+        "lever_arm=0.1: leave it out",
+    ),
+    "no unit": (
+        {"force": "force_N", "displacement": "plain"},
+        "give `displacement_units`, as displacement_units='mm'",
+    ),
     "wrong unit": (
-        {"force": "force_N", "displacement": "plain", "displacement_units": "kg"}, "unit of a displacement or of its angle"),
-    "volts": ({"force": "force_N", "displacement": "plain", "displacement_units": "V"}, "(m for each volt), and name"),
-    "force in mm": ({"force": "displacement_mm", "displacement": "plain", "displacement_units": "m"}, "unit of a force"),
-    "constant": ({"force": "force_N", "displacement": "still_mm"}, "m, so nothing moved the muscle. Take the force alone"),
-    "column as well": ({"column": "force_N", "force": "force_N", "displacement": "displacement_mm"}, "column='force_N'"),
-    "lever arm of a force": ({"column": "force_N", "lever_arm": 0.1}, "it turns a torque into a force, and column force_N"),
-    "delay too long": ({"force": "force_N", "displacement": "displacement_mm", "delay": 40.0}, "delay=40.0"),
-}  # fmt: skip
+        {"force": "force_N", "displacement": "plain", "displacement_units": "kg"},
+        "unit of a displacement or of its angle",
+    ),
+    "volts": (
+        {"force": "force_N", "displacement": "plain", "displacement_units": "V"},
+        "(m for each volt), and name",
+    ),
+    "force in mm": (
+        {"force": "displacement_mm", "displacement": "plain", "displacement_units": "m"},
+        "unit of a force",
+    ),
+    "constant": (
+        {"force": "force_N", "displacement": "still_mm"},
+        "m, so nothing moved the muscle. Take the force alone",
+    ),
+    "column as well": (
+        {"column": "force_N", "force": "force_N", "displacement": "displacement_mm"},
+        "column='force_N'",
+    ),
+    "lever arm of a force": (
+        {"column": "force_N", "lever_arm": 0.1},
+        "it turns a torque into a force, and column force_N",
+    ),
+    "delay too long": (
+        {"force": "force_N", "displacement": "displacement_mm", "delay": 40.0},
+        "delay=40.0",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -417,7 +565,9 @@ def test_text_and_figure(file):
     assert "mm rms" in text
     figure = recording.plot()
     labels = [ax.get_ylabel() for ax in figure.axes]
-    assert {"Force (N)", "Lengthening (mm)", "Gain (N/m)", "Phase (deg)", "Coherence γ²"} <= set(labels)
+    assert {"Force (N)", "Lengthening (mm)", "Gain (N/m)", "Phase (deg)", "Coherence γ²"} <= set(
+        labels
+    )
 
 
 def analyse(*arguments):
@@ -436,17 +586,23 @@ def test_the_command(file, tmp_path):
     response = jm.FrequencyResponse.from_table(found["response"])
     held = jm.load_recording(file, force="force_N", displacement="displacement_mm").steady()
     np.testing.assert_allclose(response.value, held.frequency_response().value, rtol=1e-10)
-    np.testing.assert_allclose(jm.load_frequency_response(tmp_path / "response.csv").value, response.value)
+    np.testing.assert_allclose(
+        jm.load_frequency_response(tmp_path / "response.csv").value, response.value
+    )
     wanted = {name: (m.value, m.stderr, m.unit) for name, m in held.second_order().items()}
     for name, numbers in wanted.items():
         assert tuple(found["second_order"][name].values()) == pytest.approx(numbers)
         value, error, _ = numbers
-        assert held.second_order()[name].interval == pytest.approx((value - 1.96 * error, value + 1.96 * error))
+        assert held.second_order()[name].interval == pytest.approx(
+            (value - 1.96 * error, value + 1.96 * error)
+        )
     assert found["second_order"]["delay"]["unit"] == "s"
     code, text = analyse(file, *columns)
     assert code == 2
     assert "overwrite it with --force" in text
-    assert analyse(file, *columns, "--force", "--window", "5:55", "--positive", "lengthening")[0] == 0
+    assert (
+        analyse(file, *columns, "--force", "--window", "5:55", "--positive", "lengthening")[0] == 0
+    )
 
 
 @pytest.mark.parametrize(
@@ -458,8 +614,14 @@ def test_the_command(file, tmp_path):
             ["--force-column", "force_N", "--displacement", "plain"],
             "give --displacement-units, as --displacement-units 'mm'",
         ),
-        (["--force-column", "force_N", "--displacement", "displacement_mm", "--mvc", "100"], "belong to spectra"),
-        (["--force-column", "force_N", "--displacement", "displacement_mm", "--column", "plain"], "--column 'plain'"),
+        (
+            ["--force-column", "force_N", "--displacement", "displacement_mm", "--mvc", "100"],
+            "belong to spectra",
+        ),
+        (
+            ["--force-column", "force_N", "--displacement", "displacement_mm", "--column", "plain"],
+            "--column 'plain'",
+        ),
     ],
 )
 def test_mistakes_at_the_command_line(arguments, words, file, tmp_path):
@@ -482,7 +644,13 @@ def test_the_page(file, tmp_path, monkeypatch):
     (tmp_path / "figure.csv").write_text("\n".join(rows))
     whole = "jm.fit(jm.PrescribedLength(), recording)"
     with without_intervals():
-        names = pages.run("docs/perturbed.md", None, {whole: f"{whole[:-1]}, rungs=0, starts=8, seeds=0, check_seeds=0)"})
+        names = pages.run(
+            "docs/perturbed.md",
+            None,
+            {whole: f"{whole[:-1]}, rungs=0, starts=8, seeds=0, check_seeds=0)"},
+        )
     assert names["published"].frequency.size == 3
-    np.testing.assert_allclose(jm.load_frequency_response("response.csv").value, names["response"].value)
+    np.testing.assert_allclose(
+        jm.load_frequency_response("response.csv").value, names["response"].value
+    )
     assert (tmp_path / "perturbed.png").stat().st_size > 20_000

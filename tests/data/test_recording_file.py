@@ -1,4 +1,5 @@
-"""Recordings in files: dialects, points, gaps, every kind of file, what is refused, and the command."""
+"""Recordings in files: dialects, points, gaps, every kind of file, what is refused, and the
+command."""
 
 import json
 import re
@@ -34,7 +35,9 @@ def write(folder, content, name="trial.csv"):
 
 
 def text(*columns, header="", sign=","):
-    rows = [sign.join(map(str, row)) for row in zip(*(list(column) for column in columns), strict=True)]
+    rows = [
+        sign.join(map(str, row)) for row in zip(*(list(column) for column in columns), strict=True)
+    ]
     return "\n".join([header] * bool(header) + rows) + "\n"
 
 
@@ -51,8 +54,13 @@ DIALECTS = {
     "no header": text(TIME, X),
     "windows": "\ufeff" + text(TIME, X, header='"time","force"').replace("\n", "\r\n"),
     "trailing comma": text(TIME, X, [""] * X.size, header="time,force,"),
-    "trailing comma here and there": "time,force\n"
-    + "".join(f"{t:.6f},{x:.9f}{',' * (i % 2)}\n" for i, (t, x) in enumerate(zip(TIME, X, strict=True))),
+    "trailing comma here and there": (
+        "time,force\n"
+        + "".join(
+            f"{t:.6f},{x:.9f}{',' * (i % 2)}\n"
+            for i, (t, x) in enumerate(zip(TIME, X, strict=True))
+        )
+    ),
     "more columns": text(TIME, X, X + 1, ["a"] * X.size, header="time,force,torque,note"),
 }
 
@@ -81,13 +89,20 @@ def test_ways_to_name_a_column(column, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "header", ["Time (s),Force (N),EMG_VL (mV),Trigger", "time,emg,Kraft,trigger", "time,a [mV],b [N],c"]
+    "header",
+    ["Time (s),Force (N),EMG_VL (mV),Trigger", "time,emg,Kraft,trigger", "time,a [mV],b [N],c"],
 )
 def test_the_only_column_of_force_is_found(header, tmp_path):
     """By its unit, else by its name; and said."""
     n = 500
-    columns = np.stack([np.arange(n) / 100, *np.random.default_rng(1).standard_normal((3, n))], axis=1)
-    at = next(i for i, name in enumerate(header.split(",")) if "N)" in name or "N]" in name or name == "Kraft")
+    columns = np.stack(
+        [np.arange(n) / 100, *np.random.default_rng(1).standard_normal((3, n))], axis=1
+    )
+    at = next(
+        i
+        for i, name in enumerate(header.split(","))
+        if "N)" in name or "N]" in name or name == "Kraft"
+    )
     path = tmp_path / "trial.csv"
     np.savetxt(path, columns, delimiter=",", header=header, comments="", fmt="%.9g")
     found = load_recording(path, units="N")
@@ -96,16 +111,23 @@ def test_the_only_column_of_force_is_found(header, tmp_path):
 
 
 def test_a_moved_insertion_beside_the_force_is_spoken_of(tmp_path):
-    columns = np.stack([np.arange(500) / 100, *np.random.default_rng(1).standard_normal((2, 500))], axis=1)
+    columns = np.stack(
+        [np.arange(500) / 100, *np.random.default_rng(1).standard_normal((2, 500))], axis=1
+    )
     for name, told in (("displacement (mm)", True), ("angle (deg)", True), ("EMG (mV)", False)):
         path = tmp_path / "moved.csv"
-        np.savetxt(path, columns, delimiter=",", header=f"time,force (N),{name}", comments="", fmt="%.9g")
+        np.savetxt(
+            path, columns, delimiter=",", header=f"time,force (N),{name}", comments="", fmt="%.9g"
+        )
         notices = " ".join(load_recording(path).notices)
         assert ("If a motor moved the muscle" in notices and "--displacement" in notices) == told
 
 
 def test_several_columns_of_force_are_not_chosen_between(tmp_path):
-    path = write(tmp_path, "time,Fx (N),Fy (N),Fz (N)\n" + "".join(f"{i / 100},{i},{i},{i}\n" for i in range(500)))
+    path = write(
+        tmp_path,
+        "time,Fx (N),Fy (N),Fz (N)\n" + "".join(f"{i / 100},{i},{i},{i}\n" for i in range(500)),
+    )
     with pytest.raises(ValueError, match="holds 3 columns besides the time; choose one"):
         load_recording(path)
 
@@ -120,7 +142,9 @@ def test_rate_and_unit(tmp_path):
     assert load_recording(path, rate=2000, units="Nm").unit == "N m"
     assert load_recording(path, rate=2000).notices == ("no unit stated: taken as N",)
     path = write(tmp_path, text(7 + TIME, X, header="time,force (N)"))
-    assert load_recording(path).notices == ("the time column begins at 7 s; here times count from the first sample",)
+    assert load_recording(path).notices == (
+        "the time column begins at 7 s; here times count from the first sample",
+    )
     assert "unit mN as asked; the file says N" in load_recording(path, units="mN").notices
     counted = write(tmp_path, text(np.arange(X.size), X))
     assert load_recording(counted, column=1, rate=500).rate == 500
@@ -131,9 +155,13 @@ STAND = np.random.default_rng(2).normal(size=(X.size, 3))
 NAMES = [f"{point}_{axis}" for point in ("finger", "stand") for axis in "xyz"]
 
 
-@pytest.mark.parametrize("suffixes", [("_x", "_y", "_z"), (".X", ".Y", ".Z"), (":0", ":1", ":2"), (" X", " Y", " Z")])
+@pytest.mark.parametrize(
+    "suffixes", [("_x", "_y", "_z"), (".X", ".Y", ".Z"), (":0", ":1", ":2"), (" X", " Y", " Z")]
+)
 def test_points(suffixes, tmp_path):
-    header = ",".join(["time"] + [point + suffix for point in ("finger", "stand") for suffix in suffixes])
+    header = ",".join(
+        ["time"] + [point + suffix for point in ("finger", "stand") for suffix in suffixes]
+    )
     path = write(tmp_path, text(TIME, *XYZ.T, *STAND.T, header=header))
     for axis in range(3):
         one = load_recording(path, column="finger", axis="xyz"[axis], reference="stand", units="mm")
@@ -144,7 +172,9 @@ def test_points(suffixes, tmp_path):
 
 def test_principal_axis(tmp_path):
     along = np.array([0.6, 0.0, -0.8])
-    path = write(tmp_path, text(TIME, *(np.outer(X, along) + 1e-3 * XYZ).T, header="time,f_x,f_y,f_z"))
+    path = write(
+        tmp_path, text(TIME, *(np.outer(X, along) + 1e-3 * XYZ).T, header="time,f_x,f_y,f_z")
+    )
     principal = load_recording(path, axis="principal", units="mm").whole
     # The direction turns by about 1e-3, the ratio of the other motion to this one.
     np.testing.assert_allclose(principal - principal.mean(), -(X - X.mean()), atol=1e-2)
@@ -201,7 +231,10 @@ def test_arrays(kind, column, tmp_path):
 
 def test_stated_rate_gives_way(tmp_path):
     recording = load_recording(arrays(tmp_path, "npz"), column="force", rate=500)
-    assert recording.rate == 500 and "rate 500 Hz as asked; the file states 1000 Hz" in recording.notices
+    assert (
+        recording.rate == 500
+        and "rate 500 Hz as asked; the file states 1000 Hz" in recording.notices
+    )
 
 
 @pytest.mark.slow
@@ -210,8 +243,12 @@ def test_npy(shape, tmp_path):
     np.save(tmp_path / "a.npy", X.reshape(shape))
     np.testing.assert_array_equal(load_recording(tmp_path / "a.npy", rate=100).whole, X)
     np.save(tmp_path / "b.npy", XYZ)
-    np.testing.assert_array_equal(load_recording(tmp_path / "b.npy", column=1, rate=100).whole, XYZ[:, 1])
-    np.testing.assert_array_equal(load_recording(tmp_path / "b.npy", axis="z", rate=100, units="m").whole, XYZ[:, 2])
+    np.testing.assert_array_equal(
+        load_recording(tmp_path / "b.npy", column=1, rate=100).whole, XYZ[:, 1]
+    )
+    np.testing.assert_array_equal(
+        load_recording(tmp_path / "b.npy", axis="z", rate=100, units="m").whole, XYZ[:, 2]
+    )
 
 
 @pytest.mark.slow
@@ -226,7 +263,11 @@ def test_mat_in_version_73(tmp_path):
         cell[0, 0] = file["#refs#/a"].ref
         note = file.create_dataset("note", data=np.array([[65, 66]], np.uint16))
         note.attrs["MATLAB_class"] = np.bytes_("char")
-    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + (0x0200).to_bytes(2, "little") + b"IM"
+    head = (
+        b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124)
+        + (0x0200).to_bytes(2, "little")
+        + b"IM"
+    )
     path.write_bytes(head.ljust(512, b"\0") + path.read_bytes()[512:])
     for column in ("Data:0", "trial.force", "Cell"):
         recording = load_recording(path, column=column)
@@ -237,7 +278,8 @@ def test_mat_in_version_73(tmp_path):
 
 
 class FakeC3d(dict):
-    """The part of ezc3d's `c3d` object that is documented: data and parameters as nested dictionaries."""
+    """The part of ezc3d's `c3d` object that is documented: data and parameters as nested
+    dictionaries."""
 
     def __init__(self, path):
         points = np.ones((4, 2, X.size))
@@ -247,10 +289,21 @@ class FakeC3d(dict):
         points[:3, 0, 7] = 0.0
 
         def group(labels, rate, units):
-            return {"LABELS": {"value": labels}, "RATE": {"value": np.array([rate])}, "UNITS": {"value": units}}
+            return {
+                "LABELS": {"value": labels},
+                "RATE": {"value": np.array([rate])},
+                "UNITS": {"value": units},
+            }
 
-        data = {"points": points, "meta_points": {"residuals": residuals}, "analogs": np.stack([X, X + 1])[None]}
-        parameters = {"POINT": group(["finger", "stand"], 100.0, ["mm"]), "ANALOG": group(["Fz"], 1000.0, ["N"])}
+        data = {
+            "points": points,
+            "meta_points": {"residuals": residuals},
+            "analogs": np.stack([X, X + 1])[None],
+        }
+        parameters = {
+            "POINT": group(["finger", "stand"], 100.0, ["mm"]),
+            "ANALOG": group(["Fz"], 1000.0, ["N"]),
+        }
         super().__init__(data=data, parameters=parameters)
 
 
@@ -306,42 +359,126 @@ BAD = {
     "header only": (H, {}, "holds a header (line 1) but no data"),
     "binary": (b"\x89PNG\r\n\x1a\n\0\0", {}, "is not UTF-8 text"),
     "zeros": (b"1\n\0\n", {}, "is not UTF-8 text"),
-    "text in column": (H + "0,1\n# c\n0.001,high\n", {}, "line 4: force 'high' is not a number; leave it empty"),
+    "text in column": (
+        H + "0,1\n# c\n0.001,high\n",
+        {},
+        "line 4: force 'high' is not a number; leave it empty",
+    ),
     "text in time": (H + "0,1\n12:01,2\n", {}, "line 3: time '12:01' is not a number"),
     "underscore": (H + "0,1\n0.001,1_000\n", {}, "line 3: force '1_000' is not a number"),
     "infinite": (H + "0,1\n0.001,inf\n", {}, "line 3: force is infinite"),
     "ragged": (H + "0,1\n0.001\n", {}, "line 3: 1 of 2 columns found"),
-    "decimal commas": (H + "0,0,1,5\n0,1,2,5\n", {}, "line 2: 4 of 2 columns found; decimal commas need"),
-    "preamble": ("Subject 3, knee\n" + ROWS.replace(",", ",5,"), {}, "line 2: 3 of 2 columns found; decimal commas need"),
+    "decimal commas": (
+        H + "0,0,1,5\n0,1,2,5\n",
+        {},
+        "line 2: 4 of 2 columns found; decimal commas need",
+    ),
+    "preamble": (
+        "Subject 3, knee\n" + ROWS.replace(",", ",5,"),
+        {},
+        "line 2: 3 of 2 columns found; decimal commas need",
+    ),
     "column twice": ("force,force\n1,2\n", {}, "column 'force' appears twice"),
     "no rate": (text(X), {}, "does not state its rate (no time column found); give `rate` in Hz"),
     "rate zero": (text(X), {"rate": 0}, "rate=0: give samples per second [Hz], above 0"),
-    "rate low": (text(X), {"rate": 20}, "rate=20.0: too slow: half of it lies below the last bin, 11.72 Hz"),
-    "rate contradicts": (H + ROWS, {"rate": 2048}, "rate=2048 Hz contradicts the time column 'time', which has 1000 Hz"),
+    "rate low": (
+        text(X),
+        {"rate": 20},
+        "rate=20.0: too slow: half of it lies below the last bin, 11.72 Hz",
+    ),
+    "rate contradicts": (
+        H + ROWS,
+        {"rate": 2048},
+        "rate=2048 Hz contradicts the time column 'time', which has 1000 Hz",
+    ),
     "seconds or not": (text(np.arange(40), X, header="time,force"), {}, "rate=1.0: too slow"),
     "time not uniform": (GAP, {}, "is not uniform: after 0.019 s (line 21) comes 0.021 s"),
-    "time beyond all": (H + "1e400,1\n0.001,2\n0.002,3\n", {}, "line 2: time column 'time' holds no number"),
-    "time nearly so": (H + "0,1\n0.001,2\n1e308,3\n", {}, "is not uniform: after 0.001 s (line 3) comes 1e+308 s"),
-    "open quotation": (H + ROWS + '"0.040,1\n', {}, "line 42: 1 of 2 columns found; a quotation mark"),
-    "time backwards": (H + "0,1\n0.002,2\n0.001,3\n", {}, "line 4: time column 'time' runs backwards"),
+    "time beyond all": (
+        H + "1e400,1\n0.001,2\n0.002,3\n",
+        {},
+        "line 2: time column 'time' holds no number",
+    ),
+    "time nearly so": (
+        H + "0,1\n0.001,2\n1e308,3\n",
+        {},
+        "is not uniform: after 0.001 s (line 3) comes 1e+308 s",
+    ),
+    "open quotation": (
+        H + ROWS + '"0.040,1\n',
+        {},
+        "line 42: 1 of 2 columns found; a quotation mark",
+    ),
+    "time backwards": (
+        H + "0,1\n0.002,2\n0.001,3\n",
+        {},
+        "line 4: time column 'time' runs backwards",
+    ),
     "time missing": (H + "0,1\n,2\n0.002,3\n", {}, "line 3: time column 'time' holds no number"),
     "time stands": (H + "1,1\n1,2\n", {}, "time column 'time' stands still at 1"),
-    "unknown column": (H + ROWS, {"column": "forse"}, "no column 'forse'; did you mean 'force'? Known: time, force"),
+    "unknown column": (
+        H + ROWS,
+        {"column": "forse"},
+        "no column 'forse'; did you mean 'force'? Known: time, force",
+    ),
     "column number": (H + ROWS, {"column": 7}, "no column 7; Known: time, force"),
-    "time as column": (H + ROWS, {"column": "time"}, "column 'time' is the time; choose one of force"),
-    "which column": (TWO, {"rate": 100}, "holds 2 columns besides the time; choose one with `column`: force, torque"),
+    "time as column": (
+        H + ROWS,
+        {"column": "time"},
+        "column 'time' is the time; choose one of force",
+    ),
+    "which column": (
+        TWO,
+        {"rate": 100},
+        "holds 2 columns besides the time; choose one with `column`: force, torque",
+    ),
     "constant": (text(X * 0 + 3), {"rate": 100}, "column 0: samples: constant at 3"),
-    "all empty": (text(TIME, [""] * 40, header="time,force"), {"column": 1}, "holds no number, only gaps"),
-    "long gap": (HOLE, {}, "gaps longer than max_gap=0.2 s at 0.100 s to 0.350 s; cut the recording there"),
+    "all empty": (
+        text(TIME, [""] * 40, header="time,force"),
+        {"column": 1},
+        "holds no number, only gaps",
+    ),
+    "long gap": (
+        HOLE,
+        {},
+        "gaps longer than max_gap=0.2 s at 0.100 s to 0.350 s; cut the recording there",
+    ),
     "unit": (text(X), {"rate": 100, "units": "psi"}, "units='psi': known are N, mN"),
-    "unit in header": (text(X, header="force (bar)"), {"rate": 100}, "unknown unit 'bar'; give `units`"),
+    "unit in header": (
+        text(X, header="force (bar)"),
+        {"rate": 100},
+        "unknown unit 'bar'; give `units`",
+    ),
     "axis": (POINT, {"axis": "w"}, "axis='w': choose one of x, y, z, principal"),
-    "axis left out": (POINT, {"column": "finger"}, "column='finger' is a point of three columns; give axis"),
-    "which point": (POINT, {"axis": "x"}, "holds 2 points; choose one with `column`: finger, stand"),
-    "no point": (POINT, {"column": "thumb", "axis": "x"}, "needs a point, three columns as thumb_x, thumb_y, thumb_z"),
-    "no reference": (POINT, {"column": "finger", "axis": "x", "reference": "base"}, "no point 'base' as reference"),
-    "point unit": (POINT, {"column": "finger", "axis": "x"}, "does not say in which unit finger is; give `units`"),
-    "reference": (TWO, {"rate": 100, "reference": "torq"}, "no reference 'torq'; did you mean 'torque'?"),
+    "axis left out": (
+        POINT,
+        {"column": "finger"},
+        "column='finger' is a point of three columns; give axis",
+    ),
+    "which point": (
+        POINT,
+        {"axis": "x"},
+        "holds 2 points; choose one with `column`: finger, stand",
+    ),
+    "no point": (
+        POINT,
+        {"column": "thumb", "axis": "x"},
+        "needs a point, three columns as thumb_x, thumb_y, thumb_z",
+    ),
+    "no reference": (
+        POINT,
+        {"column": "finger", "axis": "x", "reference": "base"},
+        "no point 'base' as reference",
+    ),
+    "point unit": (
+        POINT,
+        {"column": "finger", "axis": "x"},
+        "does not say in which unit finger is; give `units`",
+    ),
+    "reference": (
+        TWO,
+        {"rate": 100, "reference": "torq"},
+        "no reference 'torq'; did you mean 'torque'?",
+    ),
     "max_gap": (text(X), {"rate": 100, "max_gap": -1}, "max_gap=-1: give a time in s"),
 }
 
@@ -352,10 +489,14 @@ def test_a_torque_over_its_lever_arm_is_a_force(tmp_path, unit, scale):
     torque, force = load_recording(path), load_recording(path, lever_arm=0.25)
     assert torque.quantity == "torque" and force.unit == "N" and force.quantity == "force"
     np.testing.assert_allclose(force.whole, scale * torque.whole / 0.25, rtol=1e-12)
-    assert any("divided by the lever arm of 0.25 m: a force in N" in notice for notice in force.notices)
+    assert any(
+        "divided by the lever arm of 0.25 m: a force in N" in notice for notice in force.notices
+    )
     (trial,) = load_recordings([path], lever_arm=0.25)
     assert trial.unit == "N" and np.array_equal(trial.whole, force.whole)
-    with pytest.raises(ValueError, match=r"trial.csv: lever_arm=-1: .*give the distance from the axis"):
+    with pytest.raises(
+        ValueError, match=r"trial.csv: lever_arm=-1: .*give the distance from the axis"
+    ):
         load_recording(path, lever_arm=-1)
 
 
@@ -372,14 +513,20 @@ def test_bad_text(case, tmp_path):
 BAD_FILES = {
     "missing": ("nowhere.csv", "nowhere.csv: no such file"),
     "folder": (".", "is a folder"),
-    "kind": ("trial.xls", "a recording is one of .csv, .tsv, .txt, .dat, .asc, .xlsx, .mat, .npy, .npz, .c3d"),
+    "kind": (
+        "trial.xls",
+        "a recording is one of .csv, .tsv, .txt, .dat, .asc, .xlsx, .mat, .npy, .npz, .c3d",
+    ),
     "no kind": ("trial", "not one without ending"),
     "empty": ("empty.mat", "empty.mat: is empty"),
     "no mat": ("bad.mat", "bad.mat: cannot be read as .mat: "),
     "no npy": ("bad.npy", "bad.npy: cannot be read as .npy: "),
     "no npz": ("bad.npz", "bad.npz: cannot be read as .npz: "),
     "objects": ("object.npy", "cannot be read as .npy: Object arrays cannot be loaded"),
-    "no numbers": ("words.npy", "cannot be read as .npy: holds no numbers in one or two dimensions"),
+    "no numbers": (
+        "words.npy",
+        "cannot be read as .npy: holds no numbers in one or two dimensions",
+    ),
     "table": ("table.npz", "column='a' has several columns; choose one, as a:0"),
     "beyond": ("table.npz", "no column 'a:4'; did you mean 'a:3'? Known: a:0 to a:3"),
     "infinite": ("infinite.npy", "sample 1: 0 is infinite"),
@@ -400,16 +547,26 @@ def test_bad_files(case, tmp_path, monkeypatch):
     np.savez("table.npz", a=np.outer(X, [1, 2, 3, 4]))
     np.savez("lengths.npz", a=X, b=X[:30])
     name, message = BAD_FILES[case]
-    choice = {"table": {"column": "a"}, "beyond": {"column": "a:4"}, "lengths": {"column": "a", "reference": "b"}}
+    choice = {
+        "table": {"column": "a"},
+        "beyond": {"column": "a:4"},
+        "lengths": {"column": "a", "reference": "b"},
+    }
     with pytest.raises(ValueError) as caught:
         load_recording(name, rate=100, **choice.get(case, {}))
     assert message in str(caught.value)
 
 
-@pytest.mark.parametrize(("content", "message"), [
-    ("#BEGINCHANNELHEADER\n200,force\n1\n2\n", "no #ENDCHANNELHEADER; save the file again"),
-    ("#BEGINCHANNELHEADER\n200,force\n211,trial.csv\n#ENDCHANNELHEADER\n1\n2\n", "names the file itself for the values"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("#BEGINCHANNELHEADER\n200,force\n1\n2\n", "no #ENDCHANNELHEADER; save the file again"),
+        (
+            "#BEGINCHANNELHEADER\n200,force\n211,trial.csv\n#ENDCHANNELHEADER\n1\n2\n",
+            "names the file itself for the values",
+        ),
+    ],
+)
 def test_a_header_of_channels_that_leads_nowhere(content, message, tmp_path):
     with pytest.raises(ValueError, match=f"trial.csv: its header.*{message}"):
         load_recording(write(tmp_path, content), rate=100)
@@ -418,7 +575,10 @@ def test_a_header_of_channels_that_leads_nowhere(content, message, tmp_path):
 SIGNS = ",;\t \n\r.0123456789eE-+naNif#\"'_tm:force()x"
 
 
-@given(content=st.text(SIGNS, max_size=120) | st.binary(max_size=60), rate=st.sampled_from([None, 100.0]))
+@given(
+    content=st.text(SIGNS, max_size=120) | st.binary(max_size=60),
+    rate=st.sampled_from([None, 100.0]),
+)
 def test_any_text_gives_a_recording_or_a_message(content, rate, tmp_path_factory):
     path = write(tmp_path_factory.mktemp("any"), content)
     try:
@@ -429,15 +589,26 @@ def test_any_text_gives_a_recording_or_a_message(content, rate, tmp_path_factory
         assert isinstance(recording, Recording) and np.all(np.isfinite(recording.whole))
 
 
-VALUES = st.lists(st.floats(-1e12, 1e12), min_size=2, max_size=50).filter(lambda v: np.ptp(v) > 1e-9 * np.max(np.abs(v)))
+VALUES = st.lists(st.floats(-1e12, 1e12), min_size=2, max_size=50).filter(
+    lambda v: np.ptp(v) > 1e-9 * np.max(np.abs(v))
+)
 
 
-@given(values=VALUES, sign=st.sampled_from([",", ";", "\t"]), header=st.booleans(), comma=st.booleans(), timed=st.booleans())
+@given(
+    values=VALUES,
+    sign=st.sampled_from([",", ";", "\t"]),
+    header=st.booleans(),
+    comma=st.booleans(),
+    timed=st.booleans(),
+)
 def test_values_come_back_exactly(values, sign, header, comma, timed, tmp_path_factory):
     rows = ([np.arange(len(values)) / 250, values] if timed else [values]) if header else [values]
     body = text(*[[repr(float(value)) for value in row] for row in rows], sign=sign)
     body = body.replace(".", ",") if comma and sign != "," and len(rows) > 1 else body
-    path = write(tmp_path_factory.mktemp("exact"), (sign.join(["time", "force"][-len(rows) :]) + "\n") * header + body)
+    path = write(
+        tmp_path_factory.mktemp("exact"),
+        (sign.join(["time", "force"][-len(rows) :]) + "\n") * header + body,
+    )
     recording = load_recording(path, rate=None if len(rows) > 1 else 250)
     np.testing.assert_array_equal(recording.whole, values)
     assert recording.rate == 250
@@ -462,21 +633,50 @@ def trial(folder):
 @pytest.mark.usefixtures("as_fine_as_shipped")
 def test_command(tmp_path):
     path, out = trial(tmp_path), tmp_path / "out"
-    done = run(path, "--column", "force", "--window", "4:16", "--out", out, "--save-target", tmp_path / "held.toml")
+    done = run(
+        path,
+        "--column",
+        "force",
+        "--window",
+        "4:16",
+        "--out",
+        out,
+        "--save-target",
+        tmp_path / "held.toml",
+    )
     assert done.exit_code == 0, done.output
-    assert re.search(r"window \(s\)[ │]+12\.00\b", done.output) and re.search(r"Welch segments[ │]+8\b", done.output)
-    assert {file.name for file in out.iterdir()} == {"analysis.json", "analysis.png", "spectrum.csv"}
-    saved, record = load_target(tmp_path / "held.toml"), json.loads((out / "analysis.json").read_text())
+    assert re.search(r"window \(s\)[ │]+12\.00\b", done.output) and re.search(
+        r"Welch segments[ │]+8\b", done.output
+    )
+    assert {file.name for file in out.iterdir()} == {
+        "analysis.json",
+        "analysis.png",
+        "spectrum.csv",
+    }
+    saved, record = (
+        load_target(tmp_path / "held.toml"),
+        json.loads((out / "analysis.json").read_text()),
+    )
     held = load_recording(path, column="force").steady((4, 16))
-    np.testing.assert_allclose(saved.proportional_power, held.target().proportional_power, rtol=1e-12)
+    np.testing.assert_allclose(
+        saved.proportional_power, held.target().proportional_power, rtol=1e-12
+    )
     np.testing.assert_allclose(record["spectrum"]["power"], held.spectrum().power, rtol=1e-12)
-    assert record["recording"]["window"] == [4.0, 16.0] and record["summary"] == held.summary().to_dict()
+    assert (
+        record["recording"]["window"] == [4.0, 16.0]
+        and record["summary"] == held.summary().to_dict()
+    )
     assert (saved.name, saved.provenance) == ("held", "measured")
     assert matplotlib.image.imread(out / "analysis.png").shape[1] == 4.4 * 300
     found = run(path, "--out", out, "--force", "--json", "--format", "pdf", "--format", "svg")
     assert found.exit_code == 0 and "found automatically" in found.stderr
     assert json.loads(found.stdout) == json.loads((out / "analysis.json").read_text()) != record
-    assert {file.name for file in out.iterdir()} == {"analysis.json", "analysis.pdf", "analysis.svg", "spectrum.csv"}
+    assert {file.name for file in out.iterdir()} == {
+        "analysis.json",
+        "analysis.pdf",
+        "analysis.svg",
+        "spectrum.csv",
+    }
     options = "--out", out, "--force", "--format", "svg", "--save-target", tmp_path / "slow.toml"
     slow = run(path, "--window", "4:16", "--spectrum", "slow", *options)
     assert slow.exit_code == 0 and re.search(r"Welch segments[ │]+1\b", slow.output)

@@ -1,4 +1,5 @@
-"""Files as laboratories save them: headers of many kinds, binary formats, tables, several columns, memory."""
+"""Files as laboratories save them: headers of many kinds, binary formats, tables, several columns,
+memory."""
 
 import sys
 import tracemalloc
@@ -20,7 +21,10 @@ TIME = np.arange(X.size) / RATE
 
 
 def rows(*columns, sign="\t", comma=False):
-    cells = [[str(x).replace(".", ",") if comma else str(x) for x in row] for row in zip(*columns, strict=True)]
+    cells = [
+        [str(x).replace(".", ",") if comma else str(x) for x in row]
+        for row in zip(*columns, strict=True)
+    ]
     return "".join(sign.join(row) + "\n" for row in cells)
 
 
@@ -104,33 +108,81 @@ HEADERS = {  # content, what column is asked for, the unit found
     "LabChart": (LABCHART + VALUES + rows(TIME, X, EMG), "Force", "N"),
     "LabChart, units of the range": (LABCHART + rows(TIME, X, EMG), "Force", "N"),
     "LabChart without times": (LABCHART + VALUES + rows(X, EMG), "Force", "N"),
-    "LabChart, one channel": ("Interval=\t2 ms\nChannelTitle=\tForce\nRange=\t100 N\n" + rows(X), None, "N"),
-    "LabChart with comments": (LABCHART + rows(TIME, X, EMG).replace("\n", "\t#* start\n", 1), "Force", "N"),
-    "LabChart, decimal commas": (LABCHART.replace("0.002", "0,002") + rows(TIME, X, EMG, comma=True), "Force", "N"),
+    "LabChart, one channel": (
+        "Interval=\t2 ms\nChannelTitle=\tForce\nRange=\t100 N\n" + rows(X),
+        None,
+        "N",
+    ),
+    "LabChart with comments": (
+        LABCHART + rows(TIME, X, EMG).replace("\n", "\t#* start\n", 1),
+        "Force",
+        "N",
+    ),
+    "LabChart, decimal commas": (
+        LABCHART.replace("0.002", "0,002") + rows(TIME, X, EMG, comma=True),
+        "Force",
+        "N",
+    ),
     "Spike2": (SPIKE2.format(rows(X), rows(EMG)), "force", "N"),
     "Spike2, spreadsheet": ('"Time","1 Force"\n' + rows(TIME, X, sign=","), None, "N"),
-    "AcqKnowledge": (BIOPAC + "CH1\tCH2\t\n60\t60\t\n" + rows(X, EMG, [""] * 60), "Force - DA100C", "N"),
+    "AcqKnowledge": (
+        BIOPAC + "CH1\tCH2\t\n60\t60\t\n" + rows(X, EMG, [""] * 60),
+        "Force - DA100C",
+        "N",
+    ),
     "AcqKnowledge with times": (BIOPAC + "sec\tCH1\tCH2\n\t60\t60\n" + rows(TIME, X, EMG), 1, "N"),
-    "AcqKnowledge in ms": (BIOPAC + "milliSec\tCH1\tCH2\n" + rows(np.arange(60) * 2.0, X, EMG), 1, "N"),
-    "AcqKnowledge, commas": (BIOPAC + "sec,CH1,CH2\n,60,60\n" + rows(TIME, X, EMG, sign=","), 1, "N"),
+    "AcqKnowledge in ms": (
+        BIOPAC + "milliSec\tCH1\tCH2\n" + rows(np.arange(60) * 2.0, X, EMG),
+        1,
+        "N",
+    ),
+    "AcqKnowledge, commas": (
+        BIOPAC + "sec,CH1,CH2\n,60,60\n" + rows(TIME, X, EMG, sign=","),
+        1,
+        "N",
+    ),
     "DIAdem": (DIADEM + rows(X, EMG, comma=True), "Kraft", "N"),
     "DIAdem, csv": ("Zeit;Kraft\ns;N\n" + rows(TIME, X, sign=";", comma=True), "Kraft", "N"),
     "row of units": ("time,force,length\ns,N,mm\n" + rows(TIME, X, EMG, sign=","), "force", "N"),
     "row of units in ms": ("time\tforce\n[ms]\t[N]\n" + rows(np.arange(60) * 2, X), None, "N"),
     "empty column": ("X_Value\tForce\tComment\n" + rows(TIME, X, [""] * 60), None, "N"),
-    "all quoted": ('"time","force"\n' + rows(*([f'"{x}"' for x in column] for column in (TIME, X)), sign=","), None, "N"),
+    "all quoted": (
+        '"time","force"\n' + rows(*([f'"{x}"' for x in column] for column in (TIME, X)), sign=","),
+        None,
+        "N",
+    ),
     "for Excel": ("sep=;\nZeit;Kraft\n" + rows(TIME, X, sign=";"), None, "N"),
-    "words above": ("Subject 3, left\nknee, 60 deg\n\ntime,force\n" + rows(TIME, X, sign=","), None, "N"),
+    "words above": (
+        "Subject 3, left\nknee, 60 deg\n\ntime,force\n" + rows(TIME, X, sign=","),
+        None,
+        "N",
+    ),
     "Zeit [s]": ("Zeit [s];Kraft [N]\n" + rows(TIME, X, sign=";", comma=True), "kraft", "N"),
     "temps (ms)": ("temps (ms)\tforce (N)\n" + rows(np.arange(60) * 2, X), None, "N"),
     "only a unit": ("[s]\tForce / N\n" + rows(TIME, X), "force", "N"),
-    "unknown language": ("hora (ms),fuerza (N)\n" + rows(np.arange(60) * 2, X, sign=","), None, "N"),
+    "unknown language": (
+        "hora (ms),fuerza (N)\n" + rows(np.arange(60) * 2, X, sign=","),
+        None,
+        "N",
+    ),
     "Windows-1252": ("Zeit [s];Stärke [N]\n" + rows(TIME, X, sign=";"), "Stärke", "N"),
-    "ISO times": ("when,force\n" + rows(clock_times("%Y-%m-%dT%H:%M:%S.%f"), X, sign=","), None, "N"),
+    "ISO times": (
+        "when,force\n" + rows(clock_times("%Y-%m-%dT%H:%M:%S.%f"), X, sign=","),
+        None,
+        "N",
+    ),
     "ISO times with a zone": ("when,f_N\n" + rows(ZONED, X, sign=","), None, "N"),
-    "date and time": ("Zeit;F\n" + rows(clock_times("%d.%m.%Y %H:%M:%S.%f"), X, sign=";"), None, "N"),
+    "date and time": (
+        "Zeit;F\n" + rows(clock_times("%d.%m.%Y %H:%M:%S.%f"), X, sign=";"),
+        None,
+        "N",
+    ),
     "time of day": ("clock\tforce\n" + rows(clock_times("%H:%M:%S.%f"), X), None, "N"),
-    "past midnight": ("clock\tforce\n" + rows(clock_times("%H:%M:%S.%f", 14 * 3_600_000 - 50), X), None, "N"),
+    "past midnight": (
+        "clock\tforce\n" + rows(clock_times("%H:%M:%S.%f", 14 * 3_600_000 - 50), X),
+        None,
+        "N",
+    ),
     "rising evenly": ("a,b\n" + rows(TIME, X, sign=","), "b", "N"),
     "rising evenly, no header": (rows(TIME, X), None, "N"),
     "force_N": ("time_s,force_N\n" + rows(TIME, X, sign=","), "force", "N"),
@@ -139,7 +191,7 @@ HEADERS = {  # content, what column is asked for, the unit found
     "load cell": ("time_s,force_kg\n" + rows(TIME, X, sign=","), "force", "kgf"),
     "pounds": ("time,Force (lbs)\n" + rows(TIME, X, sign=","), "Force", "lbf"),
     "position_mm": ("time,position_mm,note\n" + rows(TIME, X, ["rest"] * 60, sign=","), None, "mm"),
-}  # fmt: skip
+}
 
 
 def write(folder, content, name="trial.txt"):
@@ -162,7 +214,9 @@ def test_headers(case, tmp_path):
 @pytest.mark.parametrize("end", ["\r\n", "\r"])
 def test_encodings(encoding, end, tmp_path):
     content = HEADERS["LabChart"][0].replace("\n", end)
-    np.testing.assert_array_equal(load_recording(write(tmp_path, content.encode(encoding)), column="Force").whole, X)
+    np.testing.assert_array_equal(
+        load_recording(write(tmp_path, content.encode(encoding)), column="Force").whole, X
+    )
 
 
 def test_spike2_has_a_rate_for_each_channel(tmp_path):
@@ -173,19 +227,27 @@ def test_spike2_has_a_rate_for_each_channel(tmp_path):
     assert (second.rate, second.unit, second.whole.size) == (250.5, "mV", 30)
 
 
-@pytest.mark.parametrize(("kind", "layout"), [("REAL64", "CHANNEL"), ("REAL32", "BLOCK"), ("ASCII", "CHANNEL")])
+@pytest.mark.parametrize(
+    ("kind", "layout"), [("REAL64", "CHANNEL"), ("REAL32", "BLOCK"), ("ASCII", "CHANNEL")]
+)
 def test_diadem_with_values_beside_it(kind, layout, tmp_path):
     extra = "211,values.bin\n213,{}\n214,{}\n220,60\n221,{}\n"
     header = DIADEM
     for number, unit in ((0, "N"), (1, "mm")):
         first = number + 1 if layout == "BLOCK" else 60 * number + 1
         header = header.replace(
-            f"202,{unit}\n210,EXPLICIT\n", f"202,{unit}\n210,EXPLICIT\n" + extra.format(layout, kind, first)
+            f"202,{unit}\n210,EXPLICIT\n",
+            f"202,{unit}\n210,EXPLICIT\n" + extra.format(layout, kind, first),
         )
-    both = np.stack([X, EMG], axis=1 if layout == "BLOCK" else 0).astype("<f4" if kind == "REAL32" else "<f8")
-    (tmp_path / "values.bin").write_bytes(rows(X, EMG).encode() if kind == "ASCII" else both.tobytes())
+    both = np.stack([X, EMG], axis=1 if layout == "BLOCK" else 0).astype(
+        "<f4" if kind == "REAL32" else "<f8"
+    )
+    (tmp_path / "values.bin").write_bytes(
+        rows(X, EMG).encode() if kind == "ASCII" else both.tobytes()
+    )
     recording = load_recording(write(tmp_path, header, "trial.dat"), column="Kraft")
-    np.testing.assert_allclose(recording.whole, X, rtol=1e-7 if kind == "REAL32" else 0)  # single precision
+    # single precision
+    np.testing.assert_allclose(recording.whole, X, rtol=1e-7 if kind == "REAL32" else 0)
     assert (recording.rate, recording.unit) == (500, "N")
     (tmp_path / "values.bin").unlink()
     with pytest.raises(ValueError, match=r"its values are in values\.bin, which is not beside it"):
@@ -193,22 +255,69 @@ def test_diadem_with_values_beside_it(kind, layout, tmp_path):
 
 
 BAD = {
-    "rate of nameless times": (rows(TIME, X), {"rate": 2000}, "rate=2000 Hz contradicts the time column '0', which"),
-    "rate of ISO times": (HEADERS["ISO times"][0], {"rate": 2000}, "contradicts the time column 'when', which has 500 Hz"),
-    "rate of Zeit": (HEADERS["Zeit [s]"][0], {"rate": 2000}, "contradicts the time column 'Zeit [s]', which has 500 Hz"),
-    "rate of LabChart": (HEADERS["LabChart"][0], {"rate": 99, "column": 1}, "contradicts the time column 'time'"),
-    "second block": (LABCHART + rows(TIME, X, EMG) * 9 + LABCHART + rows(X), {"column": 1},
-                     "line 547: 2 of 3 columns found; a second block begins there; save each block on its own"),
-    "names of other width": ("Subject 3, left\n" + rows(TIME, X, EMG, sign=","), {}, "write a # before lines that"),
-    "number among names": ("time,force\nhigh,1\n" + rows(TIME, X, sign=","), {}, "line 2: '1' cannot be the name"),
-    "damaged clock": (HEADERS["time of day"][0].replace("10:00:00.005", "10.00,5"), {}, "line 4: clock '10.00,5' is not"),
-    "bar in units row": ("time,force\ns,bar\n" + rows(TIME, X, sign=","), {}, "force: unknown unit 'bar'; give `units`"),
-    "time asked for": ("a,b\n" + rows(TIME, X, sign=","), {"time": "c"}, "no time 'c'; Known: a, b"),
-    "no waveform": ('"INFORMATION"\n"a.smr"\n"SUMMARY"\n', {}, "holds no waveform; export one from Spike2"),
-    "gap in Spike2": (SPIKE2.format(rows(X) + '"START"\t9\t0.002\n', rows(EMG)), {"column": 0}, "line 78: Force has a gap"),
+    "rate of nameless times": (
+        rows(TIME, X),
+        {"rate": 2000},
+        "rate=2000 Hz contradicts the time column '0', which",
+    ),
+    "rate of ISO times": (
+        HEADERS["ISO times"][0],
+        {"rate": 2000},
+        "contradicts the time column 'when', which has 500 Hz",
+    ),
+    "rate of Zeit": (
+        HEADERS["Zeit [s]"][0],
+        {"rate": 2000},
+        "contradicts the time column 'Zeit [s]', which has 500 Hz",
+    ),
+    "rate of LabChart": (
+        HEADERS["LabChart"][0],
+        {"rate": 99, "column": 1},
+        "contradicts the time column 'time'",
+    ),
+    "second block": (
+        LABCHART + rows(TIME, X, EMG) * 9 + LABCHART + rows(X),
+        {"column": 1},
+        "line 547: 2 of 3 columns found; a second block begins there; save each block on its own",
+    ),
+    "names of other width": (
+        "Subject 3, left\n" + rows(TIME, X, EMG, sign=","),
+        {},
+        "write a # before lines that",
+    ),
+    "number among names": (
+        "time,force\nhigh,1\n" + rows(TIME, X, sign=","),
+        {},
+        "line 2: '1' cannot be the name",
+    ),
+    "damaged clock": (
+        HEADERS["time of day"][0].replace("10:00:00.005", "10.00,5"),
+        {},
+        "line 4: clock '10.00,5' is not",
+    ),
+    "bar in units row": (
+        "time,force\ns,bar\n" + rows(TIME, X, sign=","),
+        {},
+        "force: unknown unit 'bar'; give `units`",
+    ),
+    "time asked for": (
+        "a,b\n" + rows(TIME, X, sign=","),
+        {"time": "c"},
+        "no time 'c'; Known: a, b",
+    ),
+    "no waveform": (
+        '"INFORMATION"\n"a.smr"\n"SUMMARY"\n',
+        {},
+        "holds no waveform; export one from Spike2",
+    ),
+    "gap in Spike2": (
+        SPIKE2.format(rows(X) + '"START"\t9\t0.002\n', rows(EMG)),
+        {"column": 0},
+        "line 78: Force has a gap",
+    ),
     "skip_rows": (rows(X), {"skip_rows": -1}, "skip_rows=-1: give a number of lines"),
     "all skipped": (rows(X), {"skip_rows": 60}, "holds no data, only comments"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -229,14 +338,26 @@ def test_time_and_skipped_rows(tmp_path):
 def test_guessed_milliseconds_need_the_rate(tmp_path):
     path = write(tmp_path, rows(TIME * 1000, X))
     recording = load_recording(path, rate=RATE)
-    assert recording.rate == RATE and "column 0 rises evenly and is taken as the time in ms" in recording.notices
+    assert (
+        recording.rate == RATE
+        and "column 0 rises evenly and is taken as the time in ms" in recording.notices
+    )
 
 
 def test_lines_are_read_alike_quickly_and_slowly(tmp_path):
-    """A cell that only the slow way understands changes nothing else: both give the same numbers."""
-    cells = [*map(repr, np.random.default_rng(3).normal(size=300).tolist()), "1e-3", " 2.5 ", "NaN", "3"]
+    """A cell that only the slow way understands changes nothing else: both give the same
+    numbers."""
+    cells = [
+        *map(repr, np.random.default_rng(3).normal(size=300).tolist()),
+        "1e-3",
+        " 2.5 ",
+        "NaN",
+        "3",
+    ]
     quick = load_recording(write(tmp_path, "\n".join(cells)), rate=100)
-    mixed = load_recording(write(tmp_path, "a;b\n" + "\n".join(f"{cell};1,5" for cell in cells)), column="a", rate=100)
+    mixed = load_recording(
+        write(tmp_path, "a;b\n" + "\n".join(f"{cell};1,5" for cell in cells)), column="a", rate=100
+    )
     np.testing.assert_array_equal(quick.whole, mixed.whole)
 
 
@@ -245,17 +366,26 @@ def test_all_columns(tmp_path):
     first, second = load_columns(write(tmp_path, content))
     np.testing.assert_array_equal(first.whole, X)
     np.testing.assert_array_equal(second.whole, EMG)
-    assert (first.name, second.name, second.rate, second.unit) == ("trial one_N", "trial two_N", RATE, "N")
+    assert (first.name, second.name, second.rate, second.unit) == (
+        "trial one_N",
+        "trial two_N",
+        RATE,
+        "N",
+    )
     assert [r.name for r in load_columns(tmp_path / "trial.txt", ["two"])] == ["trial two_N"]
     np.savez(tmp_path / "trials.npz", Data=np.stack([X, EMG, X + EMG], axis=1), fs=200)
-    assert [r.name for r in load_columns(tmp_path / "trials.npz")] == [f"trials Data:{i}" for i in range(3)]
+    assert [r.name for r in load_columns(tmp_path / "trials.npz")] == [
+        f"trials Data:{i}" for i in range(3)
+    ]
     assert {r.rate for r in load_columns(tmp_path / "trials.npz")} == {200}
     with pytest.raises(ValueError, match="give the names of the columns that are recordings"):
         load_columns(tmp_path / "trial.txt", [])
 
 
 INDEXES = {
-    "datetimes": pandas.DatetimeIndex(np.datetime64("2026-11-22T10:00", "ns") + np.arange(60) * np.timedelta64(2, "ms")),
+    "datetimes": pandas.DatetimeIndex(
+        np.datetime64("2026-11-22T10:00", "ns") + np.arange(60) * np.timedelta64(2, "ms")
+    ),
     "durations": pandas.TimedeltaIndex(np.arange(60) * np.timedelta64(2_000_000, "ns")),
     "seconds": pandas.Index(TIME),
     "milliseconds": pandas.Index(np.arange(60) * 2, name="time (ms)"),
@@ -285,12 +415,18 @@ def test_table_with_its_times_in_a_column():
     ("frame", "message"),
     [
         (X, "frame=ndarray: give a pandas DataFrame"),
-        (pandas.DataFrame({"a": X})["a"], "frame=Series: give a pandas DataFrame, a single column as frame.to_frame()"),
+        (
+            pandas.DataFrame({"a": X})["a"],
+            "frame=Series: give a pandas DataFrame, a single column as frame.to_frame()",
+        ),
         (pandas.DataFrame(), "the table is empty"),
         (pandas.DataFrame({"a": X}), "does not state its rate"),
         (pandas.DataFrame(np.stack([X, EMG], axis=1), columns=["a", "a"]), "two columns 'a'"),
         (pandas.DataFrame({"time": TIME, "a": X, "b": X}), "choose one with `column`: a, b"),
-        (pandas.DataFrame({"time": np.delete(np.arange(61) / 500, 30), "a": X}), "is not uniform: after 0.058 s (row 29)"),
+        (
+            pandas.DataFrame({"time": np.delete(np.arange(61) / 500, 30), "a": X}),
+            "is not uniform: after 0.058 s (row 29)",
+        ),
     ],
 )
 def test_bad_tables(frame, message):
@@ -307,7 +443,9 @@ def test_xlsx(tmp_path):
     recording = load_recording(tmp_path / "trial.xlsx")
     np.testing.assert_array_equal(recording.whole, X)
     assert (recording.rate, recording.unit) == (RATE, "N")
-    pandas.DataFrame({"when": INDEXES["datetimes"], "force": X}).to_excel(tmp_path / "dated.xlsx", index=False)
+    pandas.DataFrame({"when": INDEXES["datetimes"], "force": X}).to_excel(
+        tmp_path / "dated.xlsx", index=False
+    )
     assert load_recording(tmp_path / "dated.xlsx").rate == pytest.approx(RATE)
     frame.loc[5, "Kraft"] = "high"
     frame.to_excel(tmp_path / "trial.xlsx", index=False)
@@ -322,10 +460,21 @@ def test_edf(tmp_path, kind, bits):
     with pyedflib.EdfWriter(
         str(path), 2, {"edf": pyedflib.FILETYPE_EDFPLUS, "bdf": pyedflib.FILETYPE_BDFPLUS}[kind]
     ) as writer:
-        for i, (label, unit, rate, signal) in enumerate((("Force", "N", 500, force), ("EMG", "mV", 100, emg))):
-            writer.setSignalHeader(i, pyedflib.highlevel.make_signal_header(
-                label, dimension=unit, sample_frequency=rate, physical_min=-20, physical_max=20,
-                digital_min=-(2 ** (bits - 1)), digital_max=2 ** (bits - 1) - 1))  # fmt: skip
+        for i, (label, unit, rate, signal) in enumerate(
+            (("Force", "N", 500, force), ("EMG", "mV", 100, emg))
+        ):
+            writer.setSignalHeader(
+                i,
+                pyedflib.highlevel.make_signal_header(
+                    label,
+                    dimension=unit,
+                    sample_frequency=rate,
+                    physical_min=-20,
+                    physical_max=20,
+                    digital_min=-(2 ** (bits - 1)),
+                    digital_max=2 ** (bits - 1) - 1,
+                ),
+            )
             assert signal.size % rate == 0
         writer.writeSamples([force, emg])
         writer.writeAnnotation(0.5, -1, "go")  # a signal of its own in the file, which is none
@@ -339,11 +488,13 @@ def test_tdms(tmp_path):
     nptdms, path = pytest.importorskip("nptdms"), tmp_path / "trial.tdms"
     with nptdms.TdmsWriter(str(path)) as writer:
         step = {"wf_increment": 1 / RATE}
-        writer.write_segment([
-            nptdms.ChannelObject("arm", "Force", X, step | {"unit_string": "N"}),
-            nptdms.ChannelObject("leg", "Force", EMG, step),
-            nptdms.ChannelObject("leg", "note", ["a", "b"]),
-        ])  # fmt: skip
+        writer.write_segment(
+            [
+                nptdms.ChannelObject("arm", "Force", X, step | {"unit_string": "N"}),
+                nptdms.ChannelObject("leg", "Force", EMG, step),
+                nptdms.ChannelObject("leg", "note", ["a", "b"]),
+            ]
+        )
     recording = load_recording(path, column="arm/Force")
     np.testing.assert_array_equal(recording.whole, X)
     assert (recording.rate, recording.unit) == (RATE, "N")
@@ -363,13 +514,21 @@ def test_acq(monkeypatch):
 def test_smr(monkeypatch):
     """No library writes .smr: neo's own signals, in place of what it reads."""
     neo, quantities = pytest.importorskip("neo"), pytest.importorskip("quantities")
-    signal = neo.AnalogSignal(np.stack([X, EMG], axis=1), units="N", sampling_rate=0.5 * quantities.kHz,
-                              array_annotations={"channel_names": ["Force", "Other"]})  # fmt: skip
+    signal = neo.AnalogSignal(
+        np.stack([X, EMG], axis=1),
+        units="N",
+        sampling_rate=0.5 * quantities.kHz,
+        array_annotations={"channel_names": ["Force", "Other"]},
+    )
     segment = neo.Segment()
     segment.analogsignals.append(signal)
     blocks = types.SimpleNamespace(segments=[segment])
-    monkeypatch.setattr("neo.io.Spike2IO", lambda filename: types.SimpleNamespace(read_block=lambda lazy: blocks))
-    recording = load_recording(channels_table("trial.smr", read_smr("trial.smr", 0)), column="Force")
+    monkeypatch.setattr(
+        "neo.io.Spike2IO", lambda filename: types.SimpleNamespace(read_block=lambda lazy: blocks)
+    )
+    recording = load_recording(
+        channels_table("trial.smr", read_smr("trial.smr", 0)), column="Force"
+    )
     np.testing.assert_array_equal(recording.whole, X)
     assert (recording.rate, recording.unit) == (500, "N")
     blocks.segments.append(segment)
@@ -377,14 +536,22 @@ def test_smr(monkeypatch):
         read_smr("trial.smr", 0)
 
 
-LIBRARIES = {"xlsx": "openpyxl", "edf": "edfio", "tdms": "nptdms", "acq": "bioread", "smr": "neo.io"}
+LIBRARIES = {
+    "xlsx": "openpyxl",
+    "edf": "edfio",
+    "tdms": "nptdms",
+    "acq": "bioread",
+    "smr": "neo.io",
+}
 
 
 @pytest.mark.parametrize("kind", LIBRARIES)
 def test_without_library(kind, tmp_path, monkeypatch):
     write(tmp_path, b"raise ImportError", LIBRARIES[kind].partition(".")[0] + ".py")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ImportError, match="needs {0}: pip install {0}".format(LIBRARIES[kind].partition(".")[0])):
+    with pytest.raises(
+        ImportError, match="needs {0}: pip install {0}".format(LIBRARIES[kind].partition(".")[0])
+    ):
         load_recording(write(tmp_path, b"any", f"trial.{kind}"))
 
 

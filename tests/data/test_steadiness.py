@@ -1,4 +1,5 @@
-"""Steadiness: each number against NumPy, SciPy or its expectation, the errors against the scatter, what is refused."""
+"""Steadiness: each number against NumPy, SciPy or its expectation, the errors against the scatter,
+what is refused."""
 
 import functools
 import json
@@ -19,7 +20,16 @@ from hypothesis import strategies as st
 import jaxmuscle as jm
 from jaxmuscle.data import Measure, _steadiness
 from jaxmuscle.data._measure import likelier_error, log_interval, logit_interval, student_interval
-from jaxmuscle.data._steadiness import RANGES, _error, _interval, _own, _peak, _segments, _stated, _together
+from jaxmuscle.data._steadiness import (
+    RANGES,
+    _error,
+    _interval,
+    _own,
+    _peak,
+    _segments,
+    _stated,
+    _together,
+)
 from jaxmuscle.objective._derived import derived_names
 from jaxmuscle.spectra._bin_law import student
 from jaxmuscle.spectra._fluctuations import dfa
@@ -36,17 +46,24 @@ def density(f, tremor):
 
 @functools.cache
 def forces(count, seconds, tremor=1, seed=0):
-    """Stationary Gaussian forces with that density and standard deviation `SD`, cut from periods eight times as long."""
+    """Stationary Gaussian forces with that density and standard deviation `SD`, cut from periods
+    eight times as long."""
     n, rng = round(8 * seconds * RATE), np.random.default_rng(seed)
     f = np.fft.rfftfreq(n, 1 / RATE)
     power = density(f, tremor) * (f > 0)
     power *= SD**2 / power.sum()
     z = rng.standard_normal((count, f.size)) + 1j * rng.standard_normal((count, f.size))
-    return LEVEL + (np.fft.irfft(z * np.sqrt(power / 2), n) * n / np.sqrt(2))[:, : round(seconds * RATE)]
+    return (
+        LEVEL
+        + (np.fft.irfft(z * np.sqrt(power / 2), n) * n / np.sqrt(2))[:, : round(seconds * RATE)]
+    )
 
 
 def trials(count=3, seconds=15.0, rate=RATE, **fields):
-    return [jm.Recording(x, rate, name=f"trial {i}", **fields) for i, x in enumerate(forces(count, seconds))]
+    return [
+        jm.Recording(x, rate, name=f"trial {i}", **fields)
+        for i, x in enumerate(forces(count, seconds))
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +73,8 @@ def found():
 
 @pytest.fixture
 def user_view():
-    """As a user runs it: without the run-time type check, which would see a wrong argument first."""
+    """As a user runs it: without the run-time type check, which would see a wrong argument
+    first."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
@@ -73,16 +91,25 @@ def test_each_number_of_one_recording():
     x, one = np.ascontiguousarray(recording.filtered()), jm.steadiness(recording)
     line = np.polyval(np.polyfit(np.arange(x.size), x, 1), np.arange(x.size))
     expected = {
-        "mean": x.mean(), "standard_deviation": x.std(), CV: x.std() / x.mean(),
-        f"{CV}_without_drift": np.std(x - line) / x.mean(), "approximate_entropy": approximate_entropy(x),
-        "sample_entropy": sample_entropy(x), "dfa_exponent": dfa(x),
-    }  # fmt: skip
+        "mean": x.mean(),
+        "standard_deviation": x.std(),
+        CV: x.std() / x.mean(),
+        f"{CV}_without_drift": np.std(x - line) / x.mean(),
+        "approximate_entropy": approximate_entropy(x),
+        "sample_entropy": sample_entropy(x),
+        "dfa_exponent": dfa(x),
+    }
     for name, value in expected.items():
         assert one[name].value == pytest.approx(value, rel=1e-9), name
     assert one.measures == one.trials["trial 0"]
-    assert {name: m.error_from for name, m in one.measures.items() if m.error_from != "spectrum"} == {
-        "approximate_entropy": "parts", "sample_entropy": "parts", "dfa_exponent": "parts", "peak_frequency": "segments"
-    }  # fmt: skip
+    assert {
+        name: m.error_from for name, m in one.measures.items() if m.error_from != "spectrum"
+    } == {
+        "approximate_entropy": "parts",
+        "sample_entropy": "parts",
+        "dfa_exponent": "parts",
+        "peak_frequency": "segments",
+    }
     parts = [dfa(part) for part in np.array_split(x, 4)]
     assert one["dfa_exponent"].stderr == pytest.approx(scipy.stats.sem(parts))
 
@@ -93,44 +120,69 @@ def test_powers_add_up_to_the_variance(found):
         variance = measures["standard_deviation"].value ** 2
         assert sum(powers) == pytest.approx(variance, rel=1e-9) and min(powers) > 0
         assert sum(measures[f"share{name}"].value for name in RANGES) == pytest.approx(1, rel=1e-9)
-        assert measures["share_8_12"].value == pytest.approx(measures["power_8_12"].value / variance)
+        assert measures["share_8_12"].value == pytest.approx(
+            measures["power_8_12"].value / variance
+        )
         fast = math.sqrt(sum(powers[1:])) / measures["mean"].value
         assert measures[f"{CV}_above_0.5"].value == pytest.approx(fast, rel=1e-9)
 
 
 def test_bands_are_those_of_a_fit(found):
-    of_fits = {name.removeprefix("band") for name in derived_names(jm.Isometric()) if name.startswith("band_")}
+    of_fits = {
+        name.removeprefix("band")
+        for name in derived_names(jm.Isometric())
+        if name.startswith("band_")
+    }
     assert set(RANGES) - {"_above_12"} == of_fits
-    assert _steadiness.CUT_OFF == 30.0 and "\n  12 to 30 Hz " in str(found)  # what is above was filtered out
+    # what is above was filtered out
+    assert _steadiness.CUT_OFF == 30.0 and "\n  12 to 30 Hz " in str(found)
 
 
 @functools.cache
 def simulated():
     """The measures of a hundred recordings of 10 s, entropies left out."""
     signals = [jm.Recording(x, RATE).filtered() for x in forces(100, 10.0, seed=2)]
-    return [_own(x, "N") | {"peak_frequency": _peak([*_segments(x)[:, None]], "segments")} for x in signals]
+    return [
+        _own(x, "N") | {"peak_frequency": _peak([*_segments(x)[:, None]], "segments")}
+        for x in signals
+    ]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("low, high", [edges for edges in RANGES.values() if edges[1] < 20])
 def test_band_powers_are_the_integral_of_the_density(low, high):
-    """The mean over recordings within 4.5 standard errors; the mean of a record takes half an ordinate, 0.025 Hz, away."""
+    """The mean over recordings within 4.5 standard errors; the mean of a record takes half an
+    ordinate, 0.025 Hz, away."""
     f = np.linspace(0, 50, 400_001)
     inside = (f >= max(low, 0.025)) & (f < high)
     expected = SD**2 * density(f, 1)[inside].sum() / density(f, 1).sum()
     values = [m[f"power_{low:g}_{high:g}"].value for m in simulated()]
-    # The kernel is 0.05 Hz wide: it carries some of the power over the edges, 2 % where the density is steep.
+    # The kernel is 0.05 Hz wide: it carries some of the power over the edges, 2 % where the density
+    # is steep.
     assert abs(np.mean(values) - expected) < 4.5 * scipy.stats.sem(values) + 0.02 * expected
 
 
-SURE = ["mean", "standard_deviation", CV, f"{CV}_without_drift", f"{CV}_above_0.5", "power_0_0.5", "power_1_2",
-        "power_8_12", "share_0_0.5", "share_8_12", "sample_entropy", "dfa_exponent"]  # fmt: skip
+SURE = [
+    "mean",
+    "standard_deviation",
+    CV,
+    f"{CV}_without_drift",
+    f"{CV}_above_0.5",
+    "power_0_0.5",
+    "power_1_2",
+    "power_8_12",
+    "share_0_0.5",
+    "share_8_12",
+    "sample_entropy",
+    "dfa_exponent",
+]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SURE)
 def test_errors_of_one_recording_are_the_scatter_of_many(name):
-    """The scatter of 100 is known to 7 %, and the errors are 0.85 to 1.05 of it (docs/recordings.md)."""
+    """The scatter of 100 is known to 7 %, and the errors are 0.85 to 1.05 of it
+    (docs/recordings.md)."""
     values, errors = np.array([(m[name].value, m[name].stderr) for m in simulated()]).T
     assert 0.55 < np.sqrt(np.mean(errors**2)) / np.std(values, ddof=1) < 1.45
 
@@ -151,7 +203,9 @@ def test_three_trials_scatter_and_two_do_not(found):
         assert found[name].stderr == pytest.approx(scipy.stats.sem(values))
     two = jm.steadiness(trials()[:2])
     for name in set(two.measures) - {"peak_frequency"}:
-        values, errors = np.array([(own[name].value, own[name].stderr) for own in two.trials.values()]).T
+        values, errors = np.array(
+            [(own[name].value, own[name].stderr) for own in two.trials.values()]
+        ).T
         assert two[name].value == pytest.approx(np.mean(values))
         assert two[name].stderr == pytest.approx(np.hypot(*errors) / 2)
         assert two[name].error_from == two.trials["trial 0"][name].error_from
@@ -159,17 +213,24 @@ def test_three_trials_scatter_and_two_do_not(found):
 
 @pytest.mark.slow
 def test_the_interval_is_that_of_student(found):
-    """With t the interval holds the expected value in 95 % of a thousand people with five trials, with 1.96 in 88 %."""
+    """With t the interval holds the expected value in 95 % of a thousand people with five trials,
+    with 1.96 in 88 %."""
     low, high = found["mean"].interval
-    assert (low, high) == pytest.approx(scipy.stats.t.interval(0.95, 2, found["mean"].value, found["mean"].stderr))
+    assert (low, high) == pytest.approx(
+        scipy.stats.t.interval(0.95, 2, found["mean"].value, found["mean"].stderr)
+    )
     values = forces(5000, 10.0, seed=4).std(axis=1).reshape(1000, 5)
     far = np.abs(values.mean(axis=1) - values.mean()) / scipy.stats.sem(values, axis=1)
-    held, too_few = (scipy.stats.binomtest(int(np.sum(far < reach)), 1000, 0.95).pvalue for reach in (student(5), 1.96))
+    held, too_few = (
+        scipy.stats.binomtest(int(np.sum(far < reach)), 1000, 0.95).pvalue
+        for reach in (student(5), 1.96)
+    )
     assert held > 1e-3 > 1e-9 > too_few
 
 
 def test_the_peak_is_the_tremor(found):
-    """In 15 s it scatters by 0.3 Hz (docs/recordings.md), and one trial in thirty does not show it."""
+    """In 15 s it scatters by 0.3 Hz (docs/recordings.md), and one trial in thirty does not show
+    it."""
     assert abs(found["peak_frequency"].value - 9) < 1 and 0 < found["peak_frequency"].stderr < 2
     each = np.array([own["peak_frequency"].value for own in found.trials.values()])
     assert np.all(abs(each[np.isfinite(each)] - 9) < 1.5)
@@ -177,11 +238,14 @@ def test_the_peak_is_the_tremor(found):
 
 def test_segments_average_to_the_welch_spectrum():
     recording = trials()[0]
-    np.testing.assert_allclose(_segments(recording.filtered()).mean(axis=0), recording.spectrum().power, rtol=1e-9)
+    np.testing.assert_allclose(
+        _segments(recording.filtered()).mean(axis=0), recording.spectrum().power, rtol=1e-9
+    )
 
 
 def test_no_peak_is_no_number():
-    """A recording without a hill shows one with 4 % at most: of 30 more than 7 do once in 100 000."""
+    """A recording without a hill shows one with 4 % at most: of 30 more than 7 do once in 100
+    000."""
     signals = [jm.Recording(x, RATE).filtered() for x in forces(30, 15.0, tremor=0, seed=3)]
     peaks = [_peak([*_segments(x)[:, None]], "segments") for x in signals]
     without = np.flatnonzero([math.isnan(peak.value) for peak in peaks])
@@ -208,10 +272,16 @@ def test_the_window_is_what_counts():
     assert jm.steadiness(held)["mean"].value == pytest.approx(forces(3, 15.0)[0].mean(), rel=1e-3)
 
 
-@pytest.mark.parametrize("unit, square", [("% MVC", "(% MVC)²"), ("a.u.", "(a.u.)²"), ("N m", "(N m)²"), ("N", "N²")])
+@pytest.mark.parametrize(
+    "unit, square", [("% MVC", "(% MVC)²"), ("a.u.", "(a.u.)²"), ("N m", "(N m)²"), ("N", "N²")]
+)
 def test_units_are_said_as_they_are(unit, square):
     one = jm.steadiness(jm.Recording(forces(3, 15.0)[0], RATE, unit=unit))
-    assert one["mean"].unit == unit and one["power_0_0.5"].unit == square.replace("²", "^2") and one[CV].unit == "1"
+    assert (
+        one["mean"].unit == unit
+        and one["power_0_0.5"].unit == square.replace("²", "^2")
+        and one[CV].unit == "1"
+    )
     text = str(one)
     assert f"[{unit}]" in text and f"power by band [{square}]" in text and f" {unit}  " in text
     assert max(len(line) for line in text.splitlines()) <= 80
@@ -225,7 +295,10 @@ def test_mistakes_are_named(user_view):
         ([newtons, share], r"units differ \(b in % MVC, a in N\); convert them"),
         ("trial.csv", r"load_recording\(...\) reads a file"),
         (jm.Recording(x[:300], RATE, name="c"), "c lasts 3 s; give at least 3.84 s"),
-        (jm.Recording(np.concatenate([x, np.ones(600)]), RATE, window=(15.5, 20.5)), "is constant in the window"),
+        (
+            jm.Recording(np.concatenate([x, np.ones(600)]), RATE, window=(15.5, 20.5)),
+            "is constant in the window",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             jm.steadiness(wrong)
@@ -240,13 +313,17 @@ def test_a_mean_near_zero_has_no_variation():
 
 
 def test_trials_of_different_length_are_noticed():
-    long, short = jm.Recording(forces(3, 15.0)[0], RATE), jm.Recording(forces(3, 15.0)[1][:900], RATE)
+    long, short = (
+        jm.Recording(forces(3, 15.0)[0], RATE),
+        jm.Recording(forces(3, 15.0)[1][:900], RATE),
+    )
     assert "the trials last 9 s to 15 s" in jm.steadiness([long, short]).notices[-1]
     assert not jm.steadiness([long, jm.Recording(forces(3, 15.0)[1], RATE)]).notices
 
 
 def test_a_window_with_a_ramp_is_noticed():
-    """From rest to 10 N in 2 s, held for 15 s: all of it, a part with the ramp, and the steady part."""
+    """From rest to 10 N in 2 s, held for 15 s: all of it, a part with the ramp, and the steady
+    part."""
     x = np.concatenate([np.zeros(200), np.linspace(0, LEVEL, 200), forces(1, 15.0)[0]])
     whole = jm.Recording(x, RATE, name="whole")
     for recording in (whole, whole.steady((2.5, 19.0))):
@@ -254,7 +331,10 @@ def test_a_window_with_a_ramp_is_noticed():
         assert said.startswith("the level goes from ") and f"{LEVEL:.0f}" in said.split(" to ")[1]
         assert said in recording.target().notices
     assert not any("ramp counts" in notice for notice in jm.steadiness(whole.steady()).notices)
-    assert not any("level goes" in n for n in jm.steadiness(jm.Recording(x, RATE, unit="mm")).notices)  # a limb may move
+    # a limb may move
+    assert not any(
+        "level goes" in n for n in jm.steadiness(jm.Recording(x, RATE, unit="mm")).notices
+    )
 
 
 def test_a_unit_that_says_nothing_is_noticed():
@@ -264,46 +344,87 @@ def test_a_unit_that_says_nothing_is_noticed():
 
 
 def test_trials_that_agree_by_chance_are_noticed():
-    """Of trials that scatter as their own errors say, 1 of 100 groups; where they truly differ, none."""
+    """Of trials that scatter as their own errors say, 1 of 100 groups; where they truly differ,
+    none."""
     alike = [Measure(value, 0.1, "N^2", "spectrum") for value in (1.0, 1.001, 0.999, 1.0)]
     assert likelier_error(alike) == pytest.approx(0.05)
     draws = np.random.default_rng(3).normal(1.0, 0.1, (4000, 4))
-    found = [likelier_error([Measure(float(v), 0.1, "1", "spectrum") for v in row]) is not None for row in draws]
+    found = [
+        likelier_error([Measure(float(v), 0.1, "1", "spectrum") for v in row]) is not None
+        for row in draws
+    ]
     assert scipy.stats.binomtest(sum(found), 4000, 0.01).pvalue > 1e-4
-    one = jm.steadiness([jm.Recording(LEVEL + k + forces(1, 15.0)[0], RATE, name=f"{k}") for k in (0.0, 0.1, 0.2)])
+    one = jm.steadiness(
+        [jm.Recording(LEVEL + k + forces(1, 15.0)[0], RATE, name=f"{k}") for k in (0.0, 0.1, 0.2)]
+    )
     (said,) = (notice for notice in one.notices if "agree much better" in notice)
     own = [trial["power_2_4"].stderr for trial in one.trials.values()]
     assert f"± {np.hypot.reduce(own) / 3:.2g} from 2 to 4 Hz" in said
 
 
 def test_trials_that_are_no_trials_of_one_condition_are_noticed():
-    first, second = (jm.Recording(x, RATE, name=name) for x, name in zip(forces(3, 15.0), "ab", strict=False))
+    first, second = (
+        jm.Recording(x, RATE, name=name) for x, name in zip(forces(3, 15.0), "ab", strict=False)
+    )
     strong = jm.Recording(3 * second.samples, RATE, name="strong")
     twice = jm.Recording(first.samples, RATE, name="again")
     notices = jm.steadiness([first, strong]).notices
     low, high = (f"{np.mean(r.filtered()):.4g} {r.unit}" for r in (first, strong))
     assert notices[0].startswith(
-        f"the means of the trials reach from {low} (a) to {high} (strong): are they of one condition"
+        f"the means of the trials reach from {low} (a) to {high} (strong): are they of one"
+        " condition"
     )
     assert "three or more" in notices[1]
     assert "a and again hold the same numbers" in jm.steadiness([first, twice, second]).notices[0]
-    assert any("a and again hold the same numbers" in notice for notice in jm.data.Trials([first, twice]).target().notices)
-    assert any("are they of one condition" in notice for notice in jm.data.Trials([first, strong]).target().notices)
+    assert any(
+        "a and again hold the same numbers" in notice
+        for notice in jm.data.Trials([first, twice]).target().notices
+    )
+    assert any(
+        "are they of one condition" in notice
+        for notice in jm.data.Trials([first, strong]).target().notices
+    )
     assert not jm.data.Trials([first, second]).target().notices
 
 
 def test_tables_and_files(found, tmp_path):
     table = found.to_dataframe()
-    assert list(table) == ["trial", "duration_s", "quantity", "value", "stderr", "low", "high", "unit", "error_from"]
-    assert len(table) == 4 * len(found.measures) and list(table.trial.unique()) == [*found.trials, "all"]
+    assert list(table) == [
+        "trial",
+        "duration_s",
+        "quantity",
+        "value",
+        "stderr",
+        "low",
+        "high",
+        "unit",
+        "error_from",
+    ]
+    assert len(table) == 4 * len(found.measures) and list(table.trial.unique()) == [
+        *found.trials,
+        "all",
+    ]
     wide = table.pivot(index="trial", columns="quantity", values="value")
-    assert wide.loc["all", CV] == found[CV].value and wide.loc["trial 1", CV] == found.trials["trial 1"][CV].value
+    assert (
+        wide.loc["all", CV] == found[CV].value
+        and wide.loc["trial 1", CV] == found.trials["trial 1"][CV].value
+    )
     assert table[table.trial == "all"].duration_s.unique() == [45.0]
     found.save(tmp_path / "steadiness.json")
     read = json.loads((tmp_path / "steadiness.json").read_text())
-    assert read["measures"][CV] == vars(found[CV]) | {"interval": list(found[CV].interval)} and found[CV].unit == "1"
-    assert tuple(table[(table.trial == "all") & (table.quantity == CV)][["low", "high"]].iloc[0]) == found[CV].interval
-    assert read["trials"]["trial 2"]["duration_s"] == 15.0 and read["unit"] == "N" and "jaxmuscle" in read["versions"]
+    assert (
+        read["measures"][CV] == vars(found[CV]) | {"interval": list(found[CV].interval)}
+        and found[CV].unit == "1"
+    )
+    assert (
+        tuple(table[(table.trial == "all") & (table.quantity == CV)][["low", "high"]].iloc[0])
+        == found[CV].interval
+    )
+    assert (
+        read["trials"]["trial 2"]["duration_s"] == 15.0
+        and read["unit"] == "N"
+        and "jaxmuscle" in read["versions"]
+    )
     assert isinstance(table, pandas.DataFrame)
     figure = found.plot()
     assert len(figure.axes) == 3
@@ -329,7 +450,9 @@ def expected_interval(name, m, count, segments):
         degrees = segments - 1
     elif name.startswith("share"):
         logit = scipy.special.logit(m.value)
-        return scipy.special.expit(scipy.stats.norm.interval(0.95, logit, m.stderr / (m.value * (1 - m.value))))
+        return scipy.special.expit(
+            scipy.stats.norm.interval(0.95, logit, m.stderr / (m.value * (1 - m.value)))
+        )
     else:
         return scipy.stats.lognorm.interval(0.95, m.stderr / m.value, scale=m.value)
     low, high = scipy.stats.t.interval(0.95, degrees, m.value, m.stderr)
@@ -347,7 +470,9 @@ def test_every_error_has_the_interval_of_its_law(count, found):
         for name, m in own.items():
             assert (m.interval is None) == (m.stderr is None)
             if m.interval is not None:
-                assert m.interval == pytest.approx(expected_interval(name, m, 1, segments[i]), rel=3 * ROUNDED), name
+                assert m.interval == pytest.approx(
+                    expected_interval(name, m, 1, segments[i]), rel=3 * ROUNDED
+                ), name
 
 
 @given(POSITIVE, st.floats(0, 1e3))
@@ -362,22 +487,31 @@ def test_the_interval_of_a_share(share, ratio):
     low, high = logit_interval(share, ratio * share * (1 - share))
     rounding = 1e-12
     assert 0 <= low <= share + rounding and share - rounding <= high <= 1
-    assert logit_interval(1 - share, ratio * share * (1 - share)) == pytest.approx((1 - high, 1 - low), abs=1e-6)
+    assert logit_interval(1 - share, ratio * share * (1 - share)) == pytest.approx(
+        (1 - high, 1 - low), abs=1e-6
+    )
 
 
 def test_the_limits_of_the_law():
-    """A small share is as a power; what is certain has no width; many trials make t that of the normal law."""
+    """A small share is as a power; what is certain has no width; many trials make t that of the
+    normal law."""
     small = 1e-9
-    assert logit_interval(small, 0.5 * small) == pytest.approx(log_interval(small, 0.5 * small), rel=1e-7)
+    assert logit_interval(small, 0.5 * small) == pytest.approx(
+        log_interval(small, 0.5 * small), rel=1e-7
+    )
     low, high = log_interval(small, 0.5 * small)
-    assert [1 - end for end in logit_interval(1 - small, 0.5 * small)] == pytest.approx([high, low], rel=1e-6)
+    assert [1 - end for end in logit_interval(1 - small, 0.5 * small)] == pytest.approx(
+        [high, low], rel=1e-6
+    )
     for certain in (0.0, 1.0, 1 + 1e-15):
         assert logit_interval(certain, 0.0) == (certain, certain) == log_interval(certain, 0.0)
     assert logit_interval(1.0, 1e-20) == (1.0, 1.0)
     assert student_interval(5.0, 0.0, 2) == (5.0, 5.0)
     assert student_interval(0.0, 1.0, 10**6) == pytest.approx((-1.96, 1.96), rel=1e-5 + ROUNDED)
     error = 1e-3
-    assert log_interval(2.0, error) == pytest.approx((2 - 1.96 * error, 2 + 1.96 * error), abs=4 * error**2)
+    assert log_interval(2.0, error) == pytest.approx(
+        (2 - 1.96 * error, 2 + 1.96 * error), abs=4 * error**2
+    )
 
 
 def test_intervals_by_scatter_are_cut_where_no_value_can_lie():
@@ -397,14 +531,18 @@ def test_what_is_printed_is_what_is_saved(count, found):
     one = found if count == 3 else jm.steadiness(trials()[0])
     rows = re.findall(r"(\S+) ± (\S+)(?: N| %| Hz)? +(\S+) to (\S+)$", str(one), re.MULTILINE)
     words = list(_steadiness.WORDS)
-    names = words[:5] + [f"{kind}{name}" for kind in ("power", "share") for name in RANGES] + words[5:]
+    names = (
+        words[:5] + [f"{kind}{name}" for kind in ("power", "share") for name in RANGES] + words[5:]
+    )
     saved = one.to_dict()["measures"]
     assert len(rows) == len(names) == len(saved)
     for name, row in zip(names, rows, strict=True):
         scale = 100 if name.startswith((CV, "share")) else 1
         numbers = [saved[name]["value"], saved[name]["stderr"], *saved[name]["interval"]]
         half_a_place = 0.5 * 10.0 ** -len(row[1].partition(".")[2])
-        np.testing.assert_allclose([float(x) for x in row], np.multiply(scale, numbers), atol=1.001 * half_a_place, rtol=0)
+        np.testing.assert_allclose(
+            [float(x) for x in row], np.multiply(scale, numbers), atol=1.001 * half_a_place, rtol=0
+        )
 
 
 CHANCE = 1e-4
@@ -425,10 +563,14 @@ def held(name, truth, measures):
 
 @pytest.mark.slow
 def test_intervals_of_the_mean_hold_it(without_entropies):
-    """Of a white signal the four slowest ordinates and the mean are independent, so t is exact; 1.96 errors hold 88 %."""
+    """Of a white signal the four slowest ordinates and the mean are independent, so t is exact;
+    1.96 errors hold 88 %."""
     own = [_own(x, "N") for x in LEVEL + SD * np.random.default_rng(6).standard_normal((400, 400))]
     one = [_stated(m, 1, 2) for m in own]
-    two = [_stated({"mean": _together([a["mean"], b["mean"]])}, 2, 4) for a, b in zip(own[::2], own[1::2], strict=True)]
+    two = [
+        _stated({"mean": _together([a["mean"], b["mean"]])}, 2, 4)
+        for a, b in zip(own[::2], own[1::2], strict=True)
+    ]
     for measures in (one, two):
         low, high = scipy.stats.binom.ppf([CHANCE / 2, 1 - CHANCE / 2], len(measures), 0.95)
         assert low <= held("mean", LEVEL, measures) <= high
@@ -444,4 +586,6 @@ def recordings_of_20_s(without_entropies):
 def test_intervals_of_a_power_hold_it(name, recordings_of_20_s):
     """91 % or more by the table in docs/recordings.md, of which 1 % is chance."""
     truth = np.mean([m[name].value for m in recordings_of_20_s])
-    assert held(name, truth, recordings_of_20_s) >= scipy.stats.binom.ppf(CHANCE, len(recordings_of_20_s), 0.90)
+    assert held(name, truth, recordings_of_20_s) >= scipy.stats.binom.ppf(
+        CHANCE, len(recordings_of_20_s), 0.90
+    )

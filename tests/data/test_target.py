@@ -1,4 +1,5 @@
-"""Targets: the bundled numbers against their formulas and sources, files good and bad, grids, round trips."""
+"""Targets: the bundled numbers against their formulas and sources, files good and bad, grids, round
+trips."""
 
 import subprocess
 import sys
@@ -32,7 +33,9 @@ def slifkin_35(f):
 def hann_lobe(f, f0):
     """|Σ_n w_n exp(-2πi (f - f0) n / 100 Hz)|² of the window itself; the formula is its limit."""
     window, n = np.asarray(scipy.signal.get_window("hann", 256)), np.arange(256)
-    response = np.abs(np.exp(-2j * np.pi * np.outer(f - f0, n) / 100) @ window) ** 2 / window.sum() ** 2
+    response = (
+        np.abs(np.exp(-2j * np.pi * np.outer(f - f0, n) / 100) @ window) ** 2 / window.sum() ** 2
+    )
     return np.where(np.abs(f - f0) < 2 * 0.390625, response, 0)
 
 
@@ -92,12 +95,16 @@ def test_listing_needs_neither_jax_nor_numpy():
 def test_reconstructed_is_its_formula(name):
     target = load_target(name)
     expected = FORMULAS[name](GRID)
-    np.testing.assert_allclose(target.proportional_power, expected / expected.sum(), rtol=SIX_DIGITS)
+    np.testing.assert_allclose(
+        target.proportional_power, expected / expected.sum(), rtol=SIX_DIGITS
+    )
     assert target.sigma is not None
     np.testing.assert_allclose(target.sigma, 0.5 * target.proportional_power, rtol=1e-12)
     assert target.provenance == "reconstructed"
     assert target.settings == SpectrumSettings()
-    assert target.notices == (f"reconstructed from what the text states, not measured: {target.reason}",)
+    assert target.notices == (
+        f"reconstructed from what the text states, not measured: {target.reason}",
+    )
 
 
 @pytest.mark.parametrize(
@@ -133,7 +140,11 @@ def test_measured_facts():
         (0.0133,),
         0.2598,
     )
-    assert (fdi.segments, fdi.coefficient_of_variation, fdi.mvc_fraction) == ((2, 2), (0.0337, 0.0132), 0.45)
+    assert (fdi.segments, fdi.coefficient_of_variation, fdi.mvc_fraction) == (
+        (2, 2),
+        (0.0337, 0.0132),
+        0.45,
+    )
     assert "ApEn(2, 0.2 SD) 0.70" in vastus.source
     # The printed bins sum to 0.999998 and 0.999999.
     assert vastus.proportional_power[1] == pytest.approx(0.283833 / 0.999998, rel=1e-12)
@@ -142,8 +153,12 @@ def test_measured_facts():
 
 def test_degrees_of_freedom_add_over_trials():
     nu = lambda K: 2 * K / (1 + 2 * (1 - 1 / K) / 36)  # noqa: E731
-    assert load_target("vastus-lateralis-26mvc").degrees_of_freedom == pytest.approx(nu(12), rel=1e-4)
-    assert load_target("fdi-abduction-45mvc").degrees_of_freedom == pytest.approx(2 * nu(2), rel=1e-4)
+    assert load_target("vastus-lateralis-26mvc").degrees_of_freedom == pytest.approx(
+        nu(12), rel=1e-4
+    )
+    assert load_target("fdi-abduction-45mvc").degrees_of_freedom == pytest.approx(
+        2 * nu(2), rel=1e-4
+    )
     assert load_target("hamilton-2004").degrees_of_freedom is None
 
 
@@ -180,7 +195,9 @@ def test_saved_target_is_read_back_equal(name, tmp_path):
 
 def test_history_survives_saving(tmp_path):
     frequency = np.linspace(0.5, 6, 20)
-    target = load_target(write(tmp_path, csv_text(frequency.tolist(), (3 / frequency).tolist())), segments=[3, 4])
+    target = load_target(
+        write(tmp_path, csv_text(frequency.tolist(), (3 / frequency).tolist())), segments=[3, 4]
+    )
     assert len(target.notices) == 3
     target.save(tmp_path / "copy.toml")
     assert load_target(str(tmp_path / "copy.toml")) == target
@@ -205,7 +222,9 @@ def test_one_value_that_no_spectrum_has_is_refused(name, wrong):
         Target("mine", fields["proportional_power"], settings=settings, sigma=fields["sigma"])
 
 
-@pytest.mark.parametrize(("path", "message"), [("copy.csv", ".toml"), ("missing/copy.toml", "written")])
+@pytest.mark.parametrize(
+    ("path", "message"), [("copy.csv", ".toml"), ("missing/copy.toml", "written")]
+)
 def test_save_refuses(path, message, tmp_path):
     with pytest.raises(TargetError, match=message):
         load_target("hamilton-2004").save(tmp_path / path)
@@ -261,7 +280,10 @@ def test_no_extrapolation(tmp_path):
     np.testing.assert_array_equal(target.bins, np.arange(3, 11))
     np.testing.assert_array_equal(target.frequency, GRID[2:10])
     assert target.proportional_power.sum() == pytest.approx(1, abs=1e-12)
-    assert any("no value in the bins 1 to 2, 11 to 30, so these are left out" in notice for notice in target.notices)
+    assert any(
+        "no value in the bins 1 to 2, 11 to 30, so these are left out" in notice
+        for notice in target.notices
+    )
 
 
 def test_bins_missing_on_the_grid_stay_missing(tmp_path):
@@ -272,15 +294,25 @@ def test_bins_missing_on_the_grid_stay_missing(tmp_path):
     np.testing.assert_allclose(target.proportional_power, [0.4, 0.2, 0.2, 0.1, 0.1], rtol=1e-12)
     assert target.notices == (
         "1 row lies outside bins 1 to 30 and is left out",
-        "the spectrum has no value in the bins 4 to 6, 8, 10 to 30, so these are left out "
-        "(bin k lies at k times 0.390625 Hz)",
+        (
+            "the spectrum has no value in the bins 4 to 6, 8, 10 to 30, so these are left out "
+            "(bin k lies at k times 0.390625 Hz)"
+        ),
     )
 
 
 def test_trials_that_scatter_more_than_their_segments_explain_are_told():
-    now = Target("now", np.full(29, 1 / 29), bins=np.delete(np.arange(1, 31), 1), segments=(6, 6), dispersion=(3.0, 0.5))
+    now = Target(
+        "now",
+        np.full(29, 1 / 29),
+        bins=np.delete(np.arange(1, 31), 1),
+        segments=(6, 6),
+        dispersion=(3.0, 0.5),
+    )
     assert now.notices[0].startswith("the spectrum has no value in bin 2, so it is left out")
-    assert now.notices[1].startswith("the spectra of the trials differ 3.00 ± 0.50 times as much as by chance")
+    assert now.notices[1].startswith(
+        "the spectra of the trials differ 3.00 ± 0.50 times as much as by chance"
+    )
 
 
 @pytest.mark.parametrize(("scale", "count"), [(1.0005, 0), (0.9995, 0), (1.002, 1), (100.0, 1)])
@@ -300,7 +332,9 @@ def test_digitised_without_header_is_sorted_and_averaged(tmp_path):
 def test_average_of_equal_frequencies_does_not_depend_on_their_order(tmp_path):
     rows = ["0.390625,0.1\n", "0.390625,0.2\n", "0.390625,0.3\n"]
     assert 0.1 + 0.2 + 0.3 != 0.3 + 0.2 + 0.1
-    targets = [load_target(write(tmp_path, "".join(order) + "0.78125,1\n")) for order in (rows, rows[::-1])]
+    targets = [
+        load_target(write(tmp_path, "".join(order) + "0.78125,1\n")) for order in (rows, rows[::-1])
+    ]
     assert targets[0] == targets[1]
 
 
@@ -340,21 +374,36 @@ BAD_CSV = {
     "infinite power": (HEADER + "0.4,0.1\n0.8,inf\n", "line 3: proportional_power inf must"),
     "negative frequency": (HEADER + "-0.4,0.1\n0.8,0.2\n", "line 2: frequency -0.4 must"),
     "nan frequency": ("nan,0.1\n0.8,0.2\n", "line 1: frequency nan must"),
-    "no force has it": (HEADER + "0.4,0.1\n0.8,0.2\n4294967296,0.2\n", "line 4: frequency 4.29497e+09 Hz is above 5e+08 Hz"),
-    "unsorted": (HEADER + "0.4,0.1\n1.2,0.2\n0.8,0.2\n", "line 4: frequency 0.8 Hz is out of order"),
+    "no force has it": (
+        HEADER + "0.4,0.1\n0.8,0.2\n4294967296,0.2\n",
+        "line 4: frequency 4.29497e+09 Hz is above 5e+08 Hz",
+    ),
+    "unsorted": (
+        HEADER + "0.4,0.1\n1.2,0.2\n0.8,0.2\n",
+        "line 4: frequency 0.8 Hz is out of order",
+    ),
     "duplicate": (HEADER + "0.4,0.1\n0.4,0.2\n", "line 3: frequency 0.4 Hz appears twice"),
     "sigma": ("frequency_hz,proportional_power,sigma\n0.4,0.1,0\n", "line 2: sigma 0 must"),
     "missing cell": (HEADER + "0.4,0.1\n0.8\n", "line 3: 1 of 2 columns"),
-    "third column": ("0.4,0.1,0.05\n", "line 1: 3 of 2 columns found; a third column needs a header"),
+    "third column": (
+        "0.4,0.1,0.05\n",
+        "line 1: 3 of 2 columns found; a third column needs a header",
+    ),
     "decimal comma": ("0,4,0,1\n0,8,0,2\n", "decimal commas need a semicolon or tab"),
     "one column": ("0.4\n0.8\n", "line 1: one column"),
     "tab and semicolon": ("0.4;\t0.1\n", "line 1: holds tabs and semicolons"),
-    "unknown column": ("frequency_hz,proportional_powr\n0.4,0.1\n", "did you mean 'proportional_power'?"),
+    "unknown column": (
+        "frequency_hz,proportional_powr\n0.4,0.1\n",
+        "did you mean 'proportional_power'?",
+    ),
     "no power column": ("frequency_hz,sigma\n0.4,0.1\n", "line 1: no column 'proportional_power'"),
     "column twice": ("frequency_hz,sigma,sigma\n0.4,0.1,1\n", "column 'sigma' appears twice"),
     "one bin": (HEADER + "0.390625,1\n", "covers 1 of the bins 1 to 30"),
     "off grid, one bin": (HEADER + "0.5,1\n0.9,1\n", "covers 1 of the bins 1 to 30"),
-    "beyond the grid": (HEADER + "20,1\n30,1\n", "covers 0 of the bins 1 to 30 (0.3906 to 11.72 Hz)"),
+    "beyond the grid": (
+        HEADER + "20,1\n30,1\n",
+        "covers 0 of the bins 1 to 30 (0.3906 to 11.72 Hz)",
+    ),
 }
 
 
@@ -372,32 +421,59 @@ BAD_TOML = {
     "syntax": (dict(name='"t'), "not valid TOML: Illegal character '\\n' (at line 1"),
     "unknown key": (dict(segment="3"), "unknown key 'segment'; did you mean 'segments'?"),
     "missing key": (dict(source=None), "the key 'source' is missing"),
-    "unknown provenance": (dict(provenance='"mesured"'), "provenance 'mesured'; did you mean 'measured'?"),
+    "unknown provenance": (
+        dict(provenance='"mesured"'),
+        "provenance 'mesured'; did you mean 'measured'?",
+    ),
     "unknown quantity": (dict(quantity='"forces"'), "quantity 'forces'; did you mean 'force'?"),
     "quantity no text": (dict(quantity="3"), "unknown quantity 3"),
-    "lengths": (dict(proportional_power="[0.5, 0.5]"), "proportional_power has 2 entries, frequency_hz 3"),
+    "lengths": (
+        dict(proportional_power="[0.5, 0.5]"),
+        "proportional_power has 2 entries, frequency_hz 3",
+    ),
     "sigma length": (dict(sigma="[0.5, 0.5]"), "sigma has 2 entries, frequency_hz 3"),
-    "sigma zero": (dict(sigma="[0.5, 0, 0.5]"), "entry 2: sigma 0 must be finite and larger than 0"),
+    "sigma zero": (
+        dict(sigma="[0.5, 0, 0.5]"),
+        "entry 2: sigma 0 must be finite and larger than 0",
+    ),
     "power zero": (dict(proportional_power="[0.5, 0.5, 0]"), "entry 3: proportional_power 0 must"),
-    "power nan": (dict(proportional_power="[nan, 0.5, 0.5]"), "proportional_power[0] = nan is not finite"),
-    "power text": (dict(proportional_power='[1, "a", 1]'), "entry 2: proportional_power 'a' is not a number"),
+    "power nan": (
+        dict(proportional_power="[nan, 0.5, 0.5]"),
+        "proportional_power[0] = nan is not finite",
+    ),
+    "power text": (
+        dict(proportional_power='[1, "a", 1]'),
+        "entry 2: proportional_power 'a' is not a number",
+    ),
     "power true": (
         dict(proportional_power="[1, true, 1]"),
         "entry 2: proportional_power True is not a number",
     ),
-    "power no list": (dict(proportional_power="0.5"), "proportional_power must be a list of numbers"),
-    "huge integer": (dict(proportional_power=f"[1, 1{'0' * 400}, 1]"), "proportional_power[1] is too large a number"),
+    "power no list": (
+        dict(proportional_power="0.5"),
+        "proportional_power must be a list of numbers",
+    ),
+    "huge integer": (
+        dict(proportional_power=f"[1, 1{'0' * 400}, 1]"),
+        "proportional_power[1] is too large a number",
+    ),
     "unsorted": (dict(frequency_hz="[1, 0.5, 2]"), "entry 2: frequency 0.5 Hz is out of order"),
     "segments zero": (dict(segments="0"), "segments 0: give whole numbers of at least 1"),
     "segments fraction": (dict(segments="[2, 2.5]"), "segments 2.5: give whole numbers"),
     "segments empty": (dict(segments="[]"), "segments is an empty list"),
-    "percent": (dict(coefficient_of_variation="1.33"), "coefficient_of_variation 1.33: give a fraction"),
+    "percent": (
+        dict(coefficient_of_variation="1.33"),
+        "coefficient_of_variation 1.33: give a fraction",
+    ),
     "level": (dict(mvc_fraction="26"), "mvc_fraction 26: give a fraction"),
     "name": (dict(name='""'), "name '': give a text"),
     "no reason": (dict(provenance='"reconstructed"'), "a reconstructed target needs a reason"),
     "settings": (dict(settings="3"), "settings must be a table"),
     "unknown setting": (dict(settings="{windw = 'hann'}"), "did you mean 'window'?"),
-    "among the settings": (dict(settings="{mean = [12.0]}"), "[settings]: mean: of the target, not of its settings"),
+    "among the settings": (
+        dict(settings="{mean = [12.0]}"),
+        "[settings]: mean: of the target, not of its settings",
+    ),
     "above half the rate": (
         dict(frequency_hz="[0.390625, 0.78125, 50.390625]", settings="{rate = 100.0}"),
         "entry 3: frequency 50.3906 Hz is above 50 Hz, half of the rate in [settings]",
@@ -419,7 +495,10 @@ def test_bad_toml(case, tmp_path):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ("vastus-lateralis", "did you mean 'vastus-lateralis-26mvc'? Known: fdi-abduction-45mvc, ham"),
+        (
+            "vastus-lateralis",
+            "did you mean 'vastus-lateralis-26mvc'? Known: fdi-abduction-45mvc, ham",
+        ),
         ("vastus-lateralis", "`jaxmuscle targets`"),
         ("", "no bundled target ''"),
         ("nowhere.csv", "nowhere.csv: no such file"),

@@ -1,4 +1,5 @@
-"""Ensembles at scale: reduced, stored, swept, on several devices and by several processes, killed and resumed."""
+"""Ensembles at scale: reduced, stored, swept, on several devices and by several processes, killed
+and resumed."""
 
 import contextlib
 import json
@@ -27,7 +28,16 @@ from jaxmuscle.ensembles import _layout as layouts
 from jaxmuscle.ensembles import _run as _ensemble_run
 from jaxmuscle.ensembles import _settings
 from jaxmuscle.ensembles._processes import join
-from jaxmuscle.ensembles._running_moments import CELLS, add, count_cells, empty, merged, moments, quantiles, set_cells
+from jaxmuscle.ensembles._running_moments import (
+    CELLS,
+    add,
+    count_cells,
+    empty,
+    merged,
+    moments,
+    quantiles,
+    set_cells,
+)
 from jaxmuscle.ensembles._store import differences
 from jaxmuscle.simulation import _batch
 from jaxmuscle.simulation._simulate import schedule
@@ -44,7 +54,9 @@ class Brittle(Integral):
         return jnp.where(u[:1] > 3.3, jnp.inf, u[:1]) - y
 
 
-BRITTLE = Brittle(noise=jm.OrnsteinUhlenbeckNoise(1.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0))
+BRITTLE = Brittle(
+    noise=jm.OrnsteinUhlenbeckNoise(1.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0)
+)
 
 
 def close(a, b, rtol=1e-6):
@@ -71,12 +83,22 @@ def test_merged_moments_are_those_of_the_whole(pieces):
         whole = merged(whole, piece)
     assert whole.seeds.tolist() == [400]
     np.testing.assert_allclose(whole.mean[0], rows.mean(axis=0), rtol=1e-14)
-    np.testing.assert_allclose(whole.squares[0] / 399, rows.var(axis=0, ddof=1), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        whole.squares[0] / 399, rows.var(axis=0, ddof=1), rtol=1e-6, atol=1e-12
+    )
 
 
 def test_counted_quantiles_are_within_a_cell_of_the_exact_ones():
     rng = np.random.default_rng(1)
-    output = np.stack([rng.normal(3, 0.1, 5000), rng.exponential(size=5000), np.full(5000, 7.0), rng.uniform(size=5000)], 1)
+    output = np.stack(
+        [
+            rng.normal(3, 0.1, 5000),
+            rng.exponential(size=5000),
+            np.full(5000, 7.0),
+            rng.uniform(size=5000),
+        ],
+        1,
+    )
     levels = (0.01, 0.3, 0.5, 0.95, 0.999)
     tally = empty(1, 4, 4, len(levels), whole=False)
     set_cells(tally, 0, output[:256])
@@ -107,15 +129,22 @@ def test_a_reduced_ensemble_has_the_moments_of_the_whole_one():
         found = jm.ensemble(TASK, KEY, seeds=30, reduce=(0.1, 0.5), chunk=chunk)
         assert found.success and found.seeds == 30 and found.mean.shape == (1501,)
         close(found.mean, output.mean(axis=0))
-        close(found.variance, output.var(axis=0, ddof=1), 1e-4)  # single precision: sd / mean is 1e-2
+        # single precision: sd / mean is 1e-2
+        close(found.variance, output.var(axis=0, ddof=1), 1e-4)
         estimate = runs.mean_spectrum()
         close(found.spectrum.power, estimate.power, 1e-5)
         close(found.spectrum.stderr, estimate.stderr, 1e-3)
         close(found.spectrum.plain_power, estimate.plain_power, 1e-5)
         held = scipy.signal.sosfilt(TASK.settings.sections, output)[:, 500:1500]
         variation = held.std(axis=1) / held.mean(axis=1)
-        close(found.coefficient_of_variation, [variation.mean(), variation.std(ddof=1) / np.sqrt(30)], 1e-5)
-        exact = np.quantile(output, (0.1, 0.5), axis=0, method="inverted_cdf" if chunk == 8 else "linear")
+        close(
+            found.coefficient_of_variation,
+            [variation.mean(), variation.std(ddof=1) / np.sqrt(30)],
+            1e-5,
+        )
+        exact = np.quantile(
+            output, (0.1, 0.5), axis=0, method="inverted_cdf" if chunk == 8 else "linear"
+        )
         width = 20 * output[:8].std(axis=0).max() / CELLS if chunk == 8 else 1e-6
         assert np.abs(found.quantile - exact).max() < width
     dataset = found.to_xarray()
@@ -148,7 +177,9 @@ def test_what_breaks_is_left_out_and_named():
     runs = jm.ensemble(BRITTLE, KEY, seeds=40, reduce=True, **SHORT)
     assert 3 < len(runs.failed) < 37  # else the test shows nothing
     broken = runs.failed[:, 1]
-    with pytest.raises(jm.errors.SimulationError, match=f"{len(broken)} seed.*{broken[0]}, {broken[1]}"):
+    with pytest.raises(
+        jm.errors.SimulationError, match=f"{len(broken)} seed.*{broken[0]}, {broken[1]}"
+    ):
         jm.ensemble(BRITTLE, KEY, seeds=40, **SHORT)
     kept = np.setdiff1d(np.arange(40), broken)
     whole = jm.ensemble(BRITTLE, KEY, seeds=kept, **SHORT)
@@ -158,8 +189,12 @@ def test_what_breaks_is_left_out_and_named():
 
 @pytest.mark.slow
 def test_where_nothing_is_left_nothing_is_said():
-    broken = Brittle(noise=jm.OrnsteinUhlenbeckNoise(50.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0))
-    with pytest.raises(jm.errors.SimulationError, match="none of the first seeds of point 0 stayed finite"):
+    broken = Brittle(
+        noise=jm.OrnsteinUhlenbeckNoise(50.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0)
+    )
+    with pytest.raises(
+        jm.errors.SimulationError, match="none of the first seeds of point 0 stayed finite"
+    ):
         jm.ensemble(broken, KEY, seeds=40, reduce=True, **SHORT)
     whole = jm.ensemble(broken, KEY, seeds=8, reduce=True, **SHORT)
     assert len(whole.failed) == 8 and np.isnan(whole.mean).all() and np.isnan(whole.quantile).all()
@@ -206,15 +241,26 @@ def test_persons_differ_in_numbers_only():
     assert set(persons.labels) == {"name", "m_w", "c_w"}
     stiff = [TASK, TASK.replace(c_w=400.0)]  # the faster one asks for sub-steps
     runs = jm.ensemble(stiff, KEY, seeds=2, duration=1.0)
-    assert runs[0].substeps == runs[1].substeps == schedule(stiff[1], 1.0, 1e-3, None, None, None).grid.substeps > 1
-    with pytest.raises(ValueError, match=r"task 1 of the sweep differs from task 0 in more than numbers.*PinkNoise"):
+    assert (
+        runs[0].substeps
+        == runs[1].substeps
+        == schedule(stiff[1], 1.0, 1e-3, None, None, None).grid.substeps
+        > 1
+    )
+    with pytest.raises(
+        ValueError, match=r"task 1 of the sweep differs from task 0 in more than numbers.*PinkNoise"
+    ):
         jm.Sweep.of([TASK, jm.Isometric(noise=jm.PinkNoise())])
 
 
 def test_draws_of_any_shape_make_a_design():
     draws = {"k_w": np.full((2, 3), 4e5), "c_z": np.arange(1.0, 7.0).reshape(2, 3)}
     sweep = jm.Sweep.design(TASK, draws)
-    assert len(sweep) == 6 and sweep[3]["c_z"] == 4.0 and [t["c_z"] for t in sweep] == [1, 2, 3, 4, 5, 6]
+    assert (
+        len(sweep) == 6
+        and sweep[3]["c_z"] == 4.0
+        and [t["c_z"] for t in sweep] == [1, 2, 3, 4, 5, 6]
+    )
 
 
 @pytest.mark.parametrize(
@@ -223,7 +269,10 @@ def test_draws_of_any_shape_make_a_design():
         (lambda: jm.Sweep.of([]), "at least one task"),
         (lambda: jm.Sweep.design(TASK, {}), "columns of one length"),
         (lambda: jm.Sweep.design(TASK, {"k_w": [1e5, 2e5], "c_w": [1.0]}), "columns of one length"),
-        (lambda: jm.Sweep.design(TASK, {"k_w": [4e5, -1.0]}), "k_w = -1 at point 1 is outside its range, 0 or more"),
+        (
+            lambda: jm.Sweep.design(TASK, {"k_w": [4e5, -1.0]}),
+            "k_w = -1 at point 1 is outside its range, 0 or more",
+        ),
         (lambda: jm.Sweep.design(TASK, {"k_v": [4e5]}), "unknown parameter 'k_v'"),
         (lambda: jm.Sweep.of([TASK], names=["a", "b"]), "names has 2 entries for 1 tasks"),
         (lambda: jm.ensemble(TASK, KEY, seeds=0), "seeds = 0"),
@@ -312,13 +361,29 @@ def test_an_interrupted_store_is_resumed(tmp_path, monkeypatch, reduce):
     path = tmp_path / "runs.zarr"
     for chunks in (2, 1):
         with pytest.raises(Stop):
-            jm.ensemble(TASK, KEY, seeds=45, store=path, resume=True, progress=stopped_after(chunks), **kept, **SHORT)
+            jm.ensemble(
+                TASK,
+                KEY,
+                seeds=45,
+                store=path,
+                resume=True,
+                progress=stopped_after(chunks),
+                **kept,
+                **SHORT,
+            )
         assert xarray.open_zarr(path).attrs["complete"] is False
     with pytest.raises(ValueError, match="exists already; resume it"):
         jm.ensemble(TASK, KEY, seeds=45, store=path, **kept, **SHORT)
     left = []
     found = jm.ensemble(
-        TASK, KEY, seeds=45, store=path, resume=True, progress=lambda *told: left.append(told), **kept, **SHORT
+        TASK,
+        KEY,
+        seeds=45,
+        store=path,
+        resume=True,
+        progress=lambda *told: left.append(told),
+        **kept,
+        **SHORT,
     )
     # The last chunk before an interruption is done but was not told of yet: it is not repeated.
     assert len(left) == 6 - 3
@@ -328,7 +393,14 @@ def test_an_interrupted_store_is_resumed(tmp_path, monkeypatch, reduce):
         close(found.variance, whole.variance, 1e-12)
         np.testing.assert_allclose(found.quantile, whole.quantile, rtol=1e-12)
     again = jm.ensemble(
-        TASK, KEY, seeds=45, store=path, resume=True, progress=lambda *told: left.append(told), **kept, **SHORT
+        TASK,
+        KEY,
+        seeds=45,
+        store=path,
+        resume=True,
+        progress=lambda *told: left.append(told),
+        **kept,
+        **SHORT,
     )
     assert len(left) == 3, "a complete store is not run again"
     assert type(again) is type(found)
@@ -344,7 +416,9 @@ def test_a_store_is_overwritten_once_nothing_else_is_wrong(tmp_path):
         jm.ensemble(TASK, KEY, store=path, overwrite=True, **given | {"seeds": 0})
     assert xarray.open_zarr(path).attrs["complete"] is True
     other = jm.ensemble(TASK, jax.random.key(6), store=path, overwrite=True, **given)
-    np.testing.assert_array_equal(other["F_ext"], jm.ensemble(TASK, jax.random.key(6), **given).output)
+    np.testing.assert_array_equal(
+        other["F_ext"], jm.ensemble(TASK, jax.random.key(6), **given).output
+    )
     kept.mkdir()
     (kept / "notes.txt").write_text("not an ensemble")
     with pytest.raises(ValueError, match="is not a store that jaxmuscle wrote"):
@@ -362,7 +436,10 @@ def test_a_store_is_overwritten_once_nothing_else_is_wrong(tmp_path):
         ({"duration": 1.1}, "duration = 1.0 there, 1.1 here"),
         ({"chunk": 16}, "chunk = 8 there, 16 here"),
         ({"reduce": True}, 'kind = "trajectories" there, "reduced" here'),
-        ({"task": TASK.with_parts(P_w=jm.model.RampHold(5.0, 0.1, 0.2, 0.1))}, "inputs and everything else"),
+        (
+            {"task": TASK.with_parts(P_w=jm.model.RampHold(5.0, 0.1, 0.2, 0.1))},
+            "inputs and everything else",
+        ),
     ],
     ids=lambda value: "" if isinstance(value, str) else next(iter(value)),
 )
@@ -387,7 +464,10 @@ def test_a_store_of_another_version_is_not_resumed(tmp_path, monkeypatch):
 
 
 def test_differences_are_told_by_name():
-    there, here = {"a": 1, "b": {"c": [1, 2], "d": 0}, "e": 5}, {"a": 1, "b": {"c": [1, 3], "d": 0}, "f": 6}
+    there, here = (
+        {"a": 1, "b": {"c": [1, 2], "d": 0}, "e": 5},
+        {"a": 1, "b": {"c": [1, 3], "d": 0}, "f": 6},
+    )
     assert differences(there, here) == [
         "b.c = [1, 2] there, [1, 3] here",
         "e = 5 there, null here",
@@ -404,7 +484,9 @@ def test_something_else_is_not_taken_for_a_store(tmp_path, what):
         path.mkdir()
     else:
         xarray.Dataset({"a": ("b", np.arange(3))}).to_zarr(path, consolidated=False)
-    with pytest.raises(ValueError, match=r"x.zarr: (is not a store that jaxmuscle wrote|is not an ensemble)"):
+    with pytest.raises(
+        ValueError, match=r"x.zarr: (is not a store that jaxmuscle wrote|is not an ensemble)"
+    ):
         jm.ensemble(TASK, KEY, seeds=8, store=path, resume=True, **SHORT)
 
 
@@ -425,7 +507,9 @@ def mounted(folder, options):
     mount = shutil.which("mount")
     if (
         mount is None
-        or subprocess.run([mount, "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], capture_output=True).returncode
+        or subprocess.run(
+            [mount, "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], capture_output=True
+        ).returncode
     ):
         pytest.skip("a tmpfs cannot be mounted here")
     try:
@@ -443,14 +527,18 @@ def test_a_full_disk(small_disk, monkeypatch, reduce):
     )
     ballast = small_disk / "ballast"
     ballast.write_bytes(bytes(400_000 if reduce else 300_000))
-    with pytest.raises(OSError, match=r"No space left on device; what is complete stays: make room.*resume"):
+    with pytest.raises(
+        OSError, match=r"No space left on device; what is complete stays: make room.*resume"
+    ):
         jm.ensemble(TASK, KEY, **given)
     if (small_disk / "a.zarr").exists():
         assert xarray.open_zarr(small_disk / "a.zarr").attrs["complete"] is False
     ballast.unlink()
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
     found = jm.ensemble(TASK, KEY, **given, resume=True)
-    whole = np.asarray(jm.ensemble(TASK, KEY, seeds=200, duration=5.0, chunk=16, control=False).output, float)
+    whole = np.asarray(
+        jm.ensemble(TASK, KEY, seeds=200, duration=5.0, chunk=16, control=False).output, float
+    )
     close(found.mean if reduce else found["F_ext"], whole.mean(axis=0) if reduce else whole)
 
 
@@ -463,10 +551,17 @@ def test_a_folder_that_cannot_be_written(read_only):
 
 
 class Slow:
-    """Chunks of which the earlier ones take longer, so that on several threads they end in another order than they began."""
+    """Chunks of which the earlier ones take longer, so that on several threads they end in another
+    order than they began."""
 
     def __init__(self, monkeypatch, chunks):
-        self.simulate, self.left, self.busy, self.most, self.lock = layouts._finish, chunks, 0, 0, threading.Lock()
+        self.simulate, self.left, self.busy, self.most, self.lock = (
+            layouts._finish,
+            chunks,
+            0,
+            0,
+            threading.Lock(),
+        )
         monkeypatch.setattr(layouts, "_finish", self)
 
     def __call__(self, chunk, found):
@@ -482,14 +577,20 @@ class Slow:
 @pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 3])
 def test_threads_change_nothing(tmp_path, monkeypatch, threads):
-    """To the last bit, in whatever order they end: in memory, reduced, stored, swept, with cells and in double precision."""
+    """To the last bit, in whatever order they end: in memory, reduced, stored, swept, with cells
+    and in double precision."""
     given = {"seeds": 45, **SHORT}
     sweep = {"seeds": 11, "duration": 1.0, "chunk": 8}
     points = jm.Sweep.grid(TASK, k_w=[4e5, 5e5])
-    whole, alone = jm.ensemble(TASK, KEY, threads=1, **given), jm.ensemble(TASK, KEY, reduce=True, threads=1, **given)
+    whole, alone = (
+        jm.ensemble(TASK, KEY, threads=1, **given),
+        jm.ensemble(TASK, KEY, reduce=True, threads=1, **given),
+    )
     swept = jm.ensemble(points, KEY, reduce=True, threads=1, **sweep)
     slow = Slow(monkeypatch, 6 if threads > 1 else 0)
-    np.testing.assert_array_equal(jm.ensemble(TASK, KEY, threads=threads, **given).output, whole.output)
+    np.testing.assert_array_equal(
+        jm.ensemble(TASK, KEY, threads=threads, **given).output, whole.output
+    )
     assert slow.most == threads or jax.__version__ in _batch.WAITING  # where they may be fewer
     for given_store in ({}, {"store": tmp_path / "a.zarr"}):
         found = jm.ensemble(TASK, KEY, reduce=True, threads=threads, **given, **given_store)
@@ -497,7 +598,9 @@ def test_threads_change_nothing(tmp_path, monkeypatch, threads):
             np.testing.assert_array_equal(values, alone.arrays()[name][1])
     stored = jm.ensemble(TASK, KEY, store=tmp_path / "b.zarr", threads=threads, **given)
     np.testing.assert_array_equal(stored["F_ext"], whole.output)
-    np.testing.assert_array_equal(jm.ensemble(points, KEY, reduce=True, threads=threads, **sweep).quantile, swept.quantile)
+    np.testing.assert_array_equal(
+        jm.ensemble(points, KEY, reduce=True, threads=threads, **sweep).quantile, swept.quantile
+    )
     with jax.enable_x64(True):
         assert jm.ensemble(TASK, KEY, threads=threads, **given).output.dtype == np.float64
 
@@ -511,11 +614,22 @@ def test_what_a_thread_raises_ends_the_ensemble(monkeypatch):
         jm.ensemble(TASK, KEY, seeds=45, threads=3, **SHORT)
 
 
-@pytest.mark.parametrize(("version", "cores", "wanted", "threads"), [
-    ("0.12.0", 4, None, 4), ("0.12.0", 4, 6, 6), ("0.11.2", 4, None, 3), ("0.11.2", 4, 6, 3), ("0.11.2", 4, 2, 2),
-    ("0.11.1", 1, None, 1)])  # fmt: skip
-def test_one_core_stays_free_where_ffts_on_all_of_them_never_end(monkeypatch, version, cores, wanted, threads):
-    """Two threads that did nothing but FFTs stood still with jax 0.11.1 and 0.11.2, and did not with 0.11.0 and 0.12.0."""
+@pytest.mark.parametrize(
+    ("version", "cores", "wanted", "threads"),
+    [
+        ("0.12.0", 4, None, 4),
+        ("0.12.0", 4, 6, 6),
+        ("0.11.2", 4, None, 3),
+        ("0.11.2", 4, 6, 3),
+        ("0.11.2", 4, 2, 2),
+        ("0.11.1", 1, None, 1),
+    ],
+)
+def test_one_core_stays_free_where_ffts_on_all_of_them_never_end(
+    monkeypatch, version, cores, wanted, threads
+):
+    """Two threads that did nothing but FFTs stood still with jax 0.11.1 and 0.11.2, and did not
+    with 0.11.0 and 0.12.0."""
     monkeypatch.setattr(jax, "__version__", version)
     monkeypatch.setattr(_batch, "usable_cores", lambda: cores)
     assert _batch.threads_of(wanted) == threads
@@ -528,7 +642,8 @@ def test_threads_must_be_a_number():
 
 @pytest.mark.slow
 def test_seeds_are_shared_by_devices_and_need_not_divide(tmp_path):
-    """Three devices: 20 seeds, 5 points, and a store begun with one device. As GPUs are, which are cores here."""
+    """Three devices: 20 seeds, 5 points, and a store begun with one device. As GPUs are, which are
+    cores here."""
     program = f"""
 import jax
 jax.config.update("jax_num_cpu_devices", 3)
@@ -539,22 +654,30 @@ key, task = jax.random.key(5), jm.Isometric()
 assert _batch.local_mesh().size == 3
 runs = jm.ensemble(task, key, seeds=20, duration=1.0)
 sweep = jm.ensemble(jm.Sweep.grid(task, k_w=[4e5, 5e5, 6e5, 7e5, 8e5]), key, seeds=2, duration=1.0)
-store = jm.ensemble(task, key, seeds=45, store={str(tmp_path / "a.zarr")!r}, resume=True, duration=1.0)
-np.savez({str(tmp_path / "found.npz")!r}, runs=runs.output, sweep=np.stack([m.output for m in sweep]), store=store["F_ext"])
+path = {str(tmp_path / "a.zarr")!r}
+store = jm.ensemble(task, key, seeds=45, store=path, resume=True, duration=1.0)
+sweep = np.stack([m.output for m in sweep])
+np.savez({str(tmp_path / "found.npz")!r}, runs=runs.output, sweep=sweep, store=store["F_ext"])
 """
     with pytest.raises(Stop):
-        jm.ensemble(TASK, KEY, seeds=45, store=tmp_path / "a.zarr", progress=stopped_after(2), **SHORT)
+        jm.ensemble(
+            TASK, KEY, seeds=45, store=tmp_path / "a.zarr", progress=stopped_after(2), **SHORT
+        )
     ended(python(program))
     found = np.load(tmp_path / "found.npz")
     whole = jm.ensemble(TASK, KEY, seeds=45, **SHORT).output
     close(found["runs"], whole[:20])
     close(found["store"], whole)
-    sweep = [jm.ensemble(TASK.replace(k_w=k_w), KEY, seeds=2, **SHORT) for k_w in (4e5, 5e5, 6e5, 7e5, 8e5)]
+    sweep = [
+        jm.ensemble(TASK.replace(k_w=k_w), KEY, seeds=2, **SHORT)
+        for k_w in (4e5, 5e5, 6e5, 7e5, 8e5)
+    ]
     close(found["sweep"], np.stack([np.asarray(member.output) for member in sweep]))
 
 
 def free_port():
-    """One below those that Linux hands out (from 32768), so that nobody else gets it before it is used."""
+    """One below those that Linux hands out (from 32768), so that nobody else gets it before it is
+    used."""
     while True:
         port = random.SystemRandom().randrange(20_000, 32_768)
         with socket.socket() as listener, contextlib.suppress(OSError):
@@ -564,7 +687,13 @@ def free_port():
 
 def started(count, arguments, folder, begin=(command,) * 3):
     """Several processes of `jaxmuscle ensemble` on the loopback."""
-    common = ["ensemble", "zagrodny-slifkin", *arguments, "--coordinator", f"127.0.0.1:{free_port()}"]
+    common = [
+        "ensemble",
+        "zagrodny-slifkin",
+        *arguments,
+        "--coordinator",
+        f"127.0.0.1:{free_port()}",
+    ]
     each = [[*common, "--processes", str(count), "--process-id", str(i)] for i in range(count)]
     return [start(*one, cwd=folder, merged=True) for start, one in zip(begin, each, strict=False)]
 
@@ -572,7 +701,17 @@ def started(count, arguments, folder, begin=(command,) * 3):
 @pytest.mark.slow
 def test_several_processes_give_the_numbers_of_one(tmp_path):
     """Three, reduced; two write trajectories in the test of one that dies."""
-    arguments = ["--seeds", "60", "--duration", "1", "--chunk", "8", "--reduce", "--out", "runs.zarr"]
+    arguments = [
+        "--seeds",
+        "60",
+        "--duration",
+        "1",
+        "--chunk",
+        "8",
+        "--reduce",
+        "--out",
+        "runs.zarr",
+    ]
     workers = started(3, arguments, tmp_path)
     told = [ended(worker)[0] for worker in workers]
     assert ["Written" in text for text in told] == [True, False, False]
@@ -592,7 +731,8 @@ rank, port = int(sys.argv[1]), sys.argv[2]
 join(f"127.0.0.1:{port}", 2, rank)
 jax.devices()  # JAX itself waits for all here
 if rank == 0:
-    print(jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=12, duration=1.0).output.shape, flush=True)
+    found = jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=12, duration=1.0)
+    print(found.output.shape, flush=True)
 """
 
 
@@ -623,7 +763,9 @@ def test_a_process_that_dies_stops_the_others_and_loses_nothing(tmp_path):
     assert "another process of this run died or stopped" in told and "--resume" in told
     assert xarray.open_zarr(path).attrs["complete"] is False
     ended(command("ensemble", "zagrodny-slifkin", *arguments, "--resume", cwd=tmp_path))
-    whole = jm.ensemble(jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=1600, control=False, **SHORT)
+    whole = jm.ensemble(
+        jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=1600, control=False, **SHORT
+    )
     close(xarray.open_zarr(path)["P_w"], whole.output)
 
 
@@ -631,7 +773,12 @@ def test_a_process_that_dies_stops_the_others_and_loses_nothing(tmp_path):
 def test_processes_fail_together(tmp_path):
     """What process 0 finds wrong is said by all, in one line. Process 0 is no fork."""
     (tmp_path / "runs.zarr").write_text("a file")
-    workers = started(2, ["--seeds", "8", "--duration", "1", "--out", "runs.zarr"], tmp_path, (true_command, command))
+    workers = started(
+        2,
+        ["--seeds", "8", "--duration", "1", "--out", "runs.zarr"],
+        tmp_path,
+        (true_command, command),
+    )
     told = [ended(worker, 2)[0] for worker in workers]
     assert all("error: runs.zarr: exists already" in text for text in told)
 
@@ -640,8 +787,9 @@ RUN = """
 import sys, jax, jaxmuscle as jm, jaxmuscle.ensembles._run as run
 if sys.argv[3:] == ["to be killed"]:
     run.KEEP_EVERY = run.KEEP_SHARE = 0
-jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=1600, duration=1.0, chunk=8, store=sys.argv[1], resume=True,
-            **({"reduce": True} if sys.argv[2] == "reduced" else {}))
+how = {"reduce": True} if sys.argv[2] == "reduced" else {}
+jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=1600, duration=1.0, chunk=8,
+            store=sys.argv[1], resume=True, **how)
 """
 
 
@@ -677,7 +825,8 @@ def amount(path):
     """How much is in a store that is not complete."""
     size = 0
     for file in (path / "progress").glob("[!.]*"):
-        with contextlib.suppress(FileNotFoundError):  # a resumed run removes the tallies that it has taken over
+        # a resumed run removes the tallies that it has taken over
+        with contextlib.suppress(FileNotFoundError):
             size += file.stat().st_size
     return size
 
@@ -685,7 +834,8 @@ def amount(path):
 MEMORY = """
 import sys, jax, jaxmuscle as jm
 from jaxmuscle.ensembles._speed import peak_memory
-run = lambda seeds: jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=seeds, duration=0.2, chunk=512, reduce=True)
+run = lambda seeds: jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=seeds, duration=0.2,
+                                chunk=512, reduce=True)
 run(4096)
 before = peak_memory()
 run(65536)
@@ -707,7 +857,16 @@ RUNNER = CliRunner()
 @pytest.mark.slow
 def test_the_command_writes_resumes_and_refuses(tmp_path):
     path = tmp_path / "runs.zarr"
-    arguments = ["ensemble", "zagrodny-slifkin", "--seeds", "10", "--duration", "1", "--out", str(path)]
+    arguments = [
+        "ensemble",
+        "zagrodny-slifkin",
+        "--seeds",
+        "10",
+        "--duration",
+        "1",
+        "--out",
+        str(path),
+    ]
     first = RUNNER.invoke(app, [*arguments, "--task", "prescribed-force", "--resume"])
     assert first.exit_code == 0, first.output
     assert "there is no store yet, starting one" in first.stderr and "Written" in first.stdout
@@ -718,18 +877,39 @@ def test_the_command_writes_resumes_and_refuses(tmp_path):
     either = RUNNER.invoke(app, [*arguments, "--resume", "--force"])
     assert either.exit_code == 2 and "give one of the two" in either.stderr
     other = RUNNER.invoke(app, [*arguments, "--resume"])
-    assert other.exit_code == 2 and '"PrescribedForce" there, "PrescribedMotion" here' in "".join(other.stderr.splitlines())
+    assert other.exit_code == 2 and '"PrescribedForce" there, "PrescribedMotion" here' in "".join(
+        other.stderr.splitlines()
+    )
     replaced = RUNNER.invoke(app, [*arguments, "--force"])
     assert replaced.exit_code == 0 and xarray.open_zarr(path).attrs["task"] == "PrescribedMotion"
 
 
 @pytest.mark.slow
 def test_the_command_speaks_json(tmp_path):
-    arguments = ["--seeds", "20", "--duration", "1", "--chunk", "8", "--reduce", "--json", "--out", str(tmp_path / "a")]
-    done = RUNNER.invoke(app, ["ensemble", "zagrodny-slifkin", "--vary", "c_w=2,3", "--vary", "k_w=1e6,2e6", *arguments])
+    arguments = [
+        "--seeds",
+        "20",
+        "--duration",
+        "1",
+        "--chunk",
+        "8",
+        "--reduce",
+        "--json",
+        "--out",
+        str(tmp_path / "a"),
+    ]
+    done = RUNNER.invoke(
+        app,
+        ["ensemble", "zagrodny-slifkin", "--vary", "c_w=2,3", "--vary", "k_w=1e6,2e6", *arguments],
+    )
     assert done.exit_code == 0, done.output
     lines = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(lines) == 1 and lines[0]["event"] == "done" and lines[0]["failed"] == [] and lines[0]["seeds"] == 20
+    assert (
+        len(lines) == 1
+        and lines[0]["event"] == "done"
+        and lines[0]["failed"] == []
+        and lines[0]["seeds"] == 20
+    )
     assert dict(xarray.open_zarr(tmp_path / "a").sizes) == {"point": 4, "time": 101, "quantile": 5}
 
 
@@ -738,14 +918,20 @@ def test_the_command_speaks_json(tmp_path):
     [
         (["--seeds", "0"], "seeds = 0"),
         (["--seeds", "8", "--vary", "k_w=a"], "--vary k_w=a: give a name and numbers"),
-        (["--seeds", "8", "--reduce", "--states"], "--states keeps trajectories and --reduce throws them away"),
+        (
+            ["--seeds", "8", "--reduce", "--states"],
+            "--states keeps trajectories and --reduce throws them away",
+        ),
         (["--seeds", "8", "--processes", "2"], "belong together"),
         (["--seeds", "8", "--duration", "0.0031"], "duration = 0.0031 s is not a whole number"),
-        (["--seeds", "8", "--threads", "0"], "Invalid value for '--threads'"),  # the rest is typer's
+        # the rest is typer's
+        (["--seeds", "8", "--threads", "0"], "Invalid value for '--threads'"),
     ],
 )
 def test_the_command_refuses_bad_input(tmp_path, arguments, message):
-    done = RUNNER.invoke(app, ["ensemble", "zagrodny-slifkin", *arguments, "--out", str(tmp_path / "a.zarr")])
+    done = RUNNER.invoke(
+        app, ["ensemble", "zagrodny-slifkin", *arguments, "--out", str(tmp_path / "a.zarr")]
+    )
     assert done.exit_code == 2 and message in done.stderr.replace("\n", " ")
     assert list(tmp_path.iterdir()) == []
 
@@ -754,5 +940,7 @@ def test_the_command_refuses_bad_input(tmp_path, arguments, message):
 def test_the_speed_of_this_machine():
     found = json.loads(ended(command("speed", "--seeds", "16", "--duration", "0.2", "--json"))[0])
     assert found["compile_s"] > 0 and found["seeds_per_s"] > 0
-    assert found["million_steps_per_s"] == pytest.approx(found["seeds_per_s"] * 200 * found["substeps"] / 1e6)
+    assert found["million_steps_per_s"] == pytest.approx(
+        found["seeds_per_s"] * 200 * found["substeps"] / 1e6
+    )
     assert found["real_time_factor"] == pytest.approx(found["seeds_per_s"] * 0.2)

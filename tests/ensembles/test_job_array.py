@@ -65,7 +65,9 @@ def test_no_part_has_much_more_than_its_share(seeds, count):
     ends = np.minimum(width * np.arange(1 + -(-seeds // width)), seeds)
     shares = [Part(number, count).chunks(len(ends) - 1) for number in range(1, count + 1)]
     assert width % 8 == 0 and width <= most
-    assert max(ends[share.stop] - ends[share.start] for share in shares) <= fair + 8 * -(-fair // most)
+    assert max(ends[share.stop] - ends[share.start] for share in shares) <= fair + 8 * -(
+        -fair // most
+    )
     assert max(map(len, shares)) <= -(-fair // most)
 
 
@@ -88,11 +90,15 @@ def test_parts_in_any_order_are_one_run(anywhere, kept):
     told = []
     reports = [jm.ensemble(TASK, KEY, part=(number, 4), **given) for number in (3, 1)]
     assert jm.ensembles.attributes_of(anywhere)["complete"] is False
-    with pytest.raises(ValueError, match=r"4 of 6 chunks are missing: parts 2,4 of 4 are not done.* --part 2/4"):
+    with pytest.raises(
+        ValueError, match=r"4 of 6 chunks are missing: parts 2,4 of 4 are not done.* --part 2/4"
+    ):
         jm.ensembles.merge(anywhere)
     assert jm.ensembles.attributes_of(anywhere)["complete"] is False
     again = jm.ensemble(TASK, KEY, part=(3, 4), progress=lambda *pace: told.append(pace), **given)
-    assert not told and again == reports[0]._replace(failed=again.failed), "a part that is repeated computes nothing"
+    assert not told and again == reports[0]._replace(failed=again.failed), (
+        "a part that is repeated computes nothing"
+    )
     reports += [jm.ensemble(TASK, KEY, part=(number, 4), resume=True, **given) for number in (2, 4)]
     assert sum(report.seeds for report in reports) == 45
     assert all(report.success and not report.complete for report in reports)
@@ -103,7 +109,9 @@ def test_parts_in_any_order_are_one_run(anywhere, kept):
     late = jm.ensemble(TASK, KEY, part=(2, 4), progress=lambda *pace: told.append(pace), **given)
     assert late.complete and not told
     opened = jm.ensemble(TASK, KEY, resume=True, **given)  # the way to an `EnsembleSummary`
-    np.testing.assert_array_equal(opened.mean if kept else opened["F_ext"], found["mean"] if kept else found["F_ext"])
+    np.testing.assert_array_equal(
+        opened.mean if kept else opened["F_ext"], found["mean"] if kept else found["F_ext"]
+    )
     assert not place_of(anywhere).progress()
 
 
@@ -119,7 +127,9 @@ def test_merged_spectra_are_those_of_one_run(tmp_path):
     close(merged["plain_power"], whole.spectrum.plain_power)
     close(merged["plain_stderr"], whole.spectrum.plain_stderr)
     np.testing.assert_allclose(
-        [merged["coefficient_of_variation"], merged["coefficient_of_variation_stderr"]], whole.coefficient_of_variation, 1e-6
+        [merged["coefficient_of_variation"], merged["coefficient_of_variation_stderr"]],
+        whole.coefficient_of_variation,
+        1e-6,
     )
     opened = jm.ensemble(TASK, KEY, store=tmp_path / "a.zarr", resume=True, **given)
     np.testing.assert_array_equal(opened.spectrum.power, merged["power"])
@@ -237,7 +247,9 @@ def test_what_cannot_be_merged(tmp_path):
     with pytest.raises(ValueError, match="there is no store"):
         jm.ensembles.merge(tmp_path / "a.zarr")
     with pytest.raises(Stop):
-        jm.ensemble(TASK, KEY, seeds=24, store=tmp_path / "b.zarr", progress=stopped_after(1), **SHORT)
+        jm.ensemble(
+            TASK, KEY, seeds=24, store=tmp_path / "b.zarr", progress=stopped_after(1), **SHORT
+        )
     with pytest.raises(ValueError, match="is not made in parts; resume it"):
         jm.ensembles.merge(tmp_path / "b.zarr")
     with pytest.raises(ValueError, match="is being made without parts: resume it without --part"):
@@ -253,14 +265,20 @@ def test_what_cannot_be_merged(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("reduce", [False, True], ids=["trajectories", "reduced"])
 def test_parts_killed_at_random_end_as_one_run(tmp_path, monkeypatch, reduce):
-    """Two of the trials of benchmarks/kills.py, which has twenty, of more seeds. Killed before one part alone would end.
+    """Two of the trials of benchmarks/kills.py, which has twenty, of more seeds. Killed before one
+    part alone would end.
 
-    How long that takes changes with the load of the machine. If both ended before they were killed, more trials follow.
+    How long that takes changes with the load of the machine. If both ended before they were killed,
+    more trials follow.
     """
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
     import kills
 
-    monkeypatch.setattr(kills, "begun", lambda store, reduce, key=5, **given: Run(store, reduce, key, kills.OPTIONS | given))
+    monkeypatch.setattr(
+        kills,
+        "begun",
+        lambda store, reduce, key=5, **given: Run(store, reduce, key, kills.OPTIONS | given),
+    )
     monkeypatch.setitem(kills.OPTIONS, "seeds", 1600)
     monkeypatch.setattr(kills, "PARTS", 3)
     one, rng = kills.whole(reduce), random.Random(int(reduce))  # compiles what the parts load
@@ -277,17 +295,35 @@ def test_parts_killed_at_random_end_as_one_run(tmp_path, monkeypatch, reduce):
 
 
 def started(part, out):
-    arguments = ["--seeds", "60", "--duration", "1", "--chunk", "8", "--threads", "1", "--out", out, "--part", part]
+    arguments = [
+        "--seeds",
+        "60",
+        "--duration",
+        "1",
+        "--chunk",
+        "8",
+        "--threads",
+        "1",
+        "--out",
+        out,
+        "--part",
+        part,
+    ]
     return command("ensemble", "zagrodny-slifkin", *arguments, merged=True)
 
 
 @pytest.mark.slow
 def test_commands_that_begin_together(tmp_path):
-    """In a folder all at once; in what plays an object store, whose files are not replaced in one step, after the first."""
-    whole = jm.ensemble(jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=60, control=False, **SHORT)
+    """In a folder all at once; in what plays an object store, whose files are not replaced in one
+    step, after the first."""
+    whole = jm.ensemble(
+        jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=60, control=False, **SHORT
+    )
     for out, first in ((str(tmp_path / "a.zarr"), []), (f"local://{tmp_path}/b.zarr", ["2/3"])):
         told = [ended(started(part, out)) for part in first]
-        told += map(ended, [started(part, out) for part in ("1/3", "2/3", "3/3") if part not in first])
+        told += map(
+            ended, [started(part, out) for part in ("1/3", "2/3", "3/3") if part not in first]
+        )
         assert all(f"jaxmuscle merge {out}" in text for text, _ in told)
         done = RUNNER.invoke(app, ["merge", out])
         assert done.exit_code == 0 and f"Merged: {out}" in done.stdout, done.output
@@ -318,18 +354,36 @@ def test_the_command_makes_a_part_and_merges(tmp_path):
     first = RUNNER.invoke(app, [*arguments, "--part", "2/2", "--json"])
     assert first.exit_code == 0, first.output
     told = json.loads(first.stdout)
-    assert (told["number"], told["parts"], told["seeds"], told["failed"], told["complete"]) == (2, 2, 8, [], False)
+    assert (told["number"], told["parts"], told["seeds"], told["failed"], told["complete"]) == (
+        2,
+        2,
+        8,
+        [],
+        False,
+    )
     early = RUNNER.invoke(app, ["merge", str(path)])
-    assert early.exit_code == 2 and "parts 1 of 2 are not done" in early.stderr and "--part 1/2" in early.stderr
+    assert (
+        early.exit_code == 2
+        and "parts 1 of 2 are not done" in early.stderr
+        and "--part 1/2" in early.stderr
+    )
     alone = RUNNER.invoke(app, [*arguments, "--resume"])
     assert alone.exit_code == 2 and "is being made in 2 parts" in alone.stderr
     RUNNER.invoke(app, [*arguments, "--part", "1/2", "--resume"])
     merged = RUNNER.invoke(app, ["merge", str(path), "--json"])
-    assert merged.exit_code == 0 and json.loads(merged.stdout) == {"event": "done", "out": str(path), "failed": []}
+    assert merged.exit_code == 0 and json.loads(merged.stdout) == {
+        "event": "done",
+        "out": str(path),
+        "failed": [],
+    }
     after = RUNNER.invoke(app, [*arguments, "--part", "1/2"])
     assert after.exit_code == 0 and "was complete, nothing to do" in after.stdout
     opened = RUNNER.invoke(app, [*arguments, "--resume"])
-    assert opened.exit_code == 0 and "16 seeds" in opened.stdout and "was complete, nothing to do" in opened.stdout
+    assert (
+        opened.exit_code == 0
+        and "16 seeds" in opened.stdout
+        and "was complete, nothing to do" in opened.stdout
+    )
 
 
 @pytest.mark.parametrize(
@@ -340,11 +394,23 @@ def test_the_command_makes_a_part_and_merges(tmp_path):
         (["--part", "2"], "--part 2: write I/N with whole numbers"),
         (["--part", "-1/4"], "--part -1/4: write I/N with whole numbers"),
         (["--part", "1/2", "--force"], "it cannot overwrite it: remove the store first"),
-        (["--part", "1/2", "--processes", "2"], "a part is a process of its own: leave out --coordinator"),
+        (
+            ["--part", "1/2", "--processes", "2"],
+            "a part is a process of its own: leave out --coordinator",
+        ),
     ],
 )
 def test_the_command_refuses(tmp_path, arguments, message):
-    common = ["ensemble", "zagrodny-slifkin", "--seeds", "8", "--duration", "1", "--out", str(tmp_path / "a.zarr")]
+    common = [
+        "ensemble",
+        "zagrodny-slifkin",
+        "--seeds",
+        "8",
+        "--duration",
+        "1",
+        "--out",
+        str(tmp_path / "a.zarr"),
+    ]
     done = RUNNER.invoke(app, [*common, *arguments])
     assert done.exit_code == 2 and message in done.stderr.replace("\n", " ")
     assert list(tmp_path.iterdir()) == []
@@ -376,7 +442,10 @@ def test_a_store_at_a_url_is_resumed_and_overwritten(tmp_path, monkeypatch, kept
     same_as_one_run(xarray.open_zarr(url), 45, kept)
     jm.ensemble(TASK, jax.random.key(6), overwrite=True, **given | {"seeds": 20})
     found = xarray.open_zarr(url)
-    assert found.attrs["complete"] is True and json.loads(found.attrs["settings"])["seeds"] == "0 to 19"
+    assert (
+        found.attrs["complete"] is True
+        and json.loads(found.attrs["settings"])["seeds"] == "0 to 19"
+    )
     assert not place_of(url).progress()
     assert not (tmp_path / "a.zarr").exists()
 
@@ -420,7 +489,10 @@ def test_something_else_at_a_url_is_left_alone(tmp_path):
     for begin in ({}, {"resume": True}, {"overwrite": True}, {"part": (1, 2)}):
         with pytest.raises(ValueError, match=r"exists already|is not a store that jaxmuscle wrote"):
             jm.ensemble(TASK, KEY, seeds=8, store=url, **begin, **SHORT)
-    assert place_of(url).read("notes.txt") == b"not an ensemble" and place_of(url).read("zarr.json") is None
+    assert (
+        place_of(url).read("notes.txt") == b"not an ensemble"
+        and place_of(url).read("zarr.json") is None
+    )
 
 
 def test_a_file_url_is_a_folder(tmp_path):
@@ -438,10 +510,15 @@ def test_urls_that_cannot_be_used(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(type(place_of("memory://a").files), "exists", unreachable)
-        with pytest.raises(ValueError, match=r"memory://a: cannot be reached \(RuntimeError: no credentials\); check"):
+        with pytest.raises(
+            ValueError,
+            match=r"memory://a: cannot be reached \(RuntimeError: no credentials\); check",
+        ):
             jm.ensemble(TASK, KEY, store="memory://a", **given)
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     with pytest.raises(ValueError, match=r"memory://a: a URL needs fsspec: pip install fsspec"):
         jm.ensemble(TASK, KEY, store="memory://a", **given)
-    done = RUNNER.invoke(app, ["ensemble", "zagrodny-slifkin", "--seeds", "8", "--out", "memory://a"])
+    done = RUNNER.invoke(
+        app, ["ensemble", "zagrodny-slifkin", "--seeds", "8", "--out", "memory://a"]
+    )
     assert done.exit_code == 2 and "a URL needs fsspec" in done.stderr

@@ -1,4 +1,5 @@
-"""What stores promise: one writer at a time, nothing lost or changed unnoticed, what is damaged made again."""
+"""What stores promise: one writer at a time, nothing lost or changed unnoticed, what is damaged
+made again."""
 
 import json
 import os
@@ -26,7 +27,9 @@ from jaxmuscle.ensembles._tallies import read_tallies, tally_keys
 
 KINDS = pytest.mark.parametrize("kept", [{}, {"reduce": True}], ids=["trajectories", "reduced"])
 WAYS = pytest.mark.parametrize(
-    "kept, parts", [({}, 0), ({"reduce": True}, 0), ({"reduce": True}, 3)], ids=["trajectories", "reduced", "merged"]
+    "kept, parts",
+    [({}, 0), ({"reduce": True}, 0), ({"reduce": True}, 3)],
+    ids=["trajectories", "reduced", "merged"],
 )
 
 
@@ -43,11 +46,17 @@ def made(path, kept, parts=0, seeds=45):
 
 
 def files_of(path):
-    return {file.relative_to(path).as_posix(): file.read_bytes() for file in sorted(Path(path).rglob("*")) if file.is_file()}
+    return {
+        file.relative_to(path).as_posix(): file.read_bytes()
+        for file in sorted(Path(path).rglob("*"))
+        if file.is_file()
+    }
 
 
 def chunks_of(path):
-    return sorted(file for file in Path(path).rglob("*") if file.is_file() and file.name != "zarr.json")
+    return sorted(
+        file for file in Path(path).rglob("*") if file.is_file() and file.name != "zarr.json"
+    )
 
 
 def flipped(data, bit):
@@ -62,7 +71,8 @@ def flipped(data, bit):
 @pytest.mark.slow
 @KINDS
 def test_a_hundred_flipped_bits_are_noticed(tmp_path, kept):
-    """Of chunks, at random places: by the package, and by whoever reads the chunk through xarray."""
+    """Of chunks, at random places: by the package, and by whoever reads the chunk through
+    xarray."""
     path, rng, noticed = tmp_path / "a.zarr", random.Random(0), 0
     made(path, kept)
     whole = jm.ensembles.open_store(path).load()
@@ -70,7 +80,10 @@ def test_a_hundred_flipped_bits_are_noticed(tmp_path, kept):
         file = rng.choice(chunks_of(path))
         data = file.read_bytes()
         file.write_bytes(flipped(data, rng.randrange(8 * len(data))))
-        with pytest.raises(jm.errors.StoreError, match=rf"1 damaged or missing \({file.relative_to(path)}\).*--resume"):
+        with pytest.raises(
+            jm.errors.StoreError,
+            match=rf"1 damaged or missing \({file.relative_to(path)}\).*--resume",
+        ):
             jm.ensembles.open_store(path)
         if turn < 10:
             with pytest.raises(ValueError, match="checksum"):
@@ -91,8 +104,12 @@ def test_flipped_bits_of_the_description_are_noticed(tmp_path):
             with pytest.raises(jm.errors.StoreError, match=r"damaged|is not a"):
                 jm.ensembles.open_store(path)
         (path / name).write_bytes(data)
-    (path / "zarr.json").write_bytes(data := (path / "zarr.json").read_bytes().replace(b'"duration', b'"durative', 1))
-    with pytest.raises(jm.errors.StoreError, match=r"its description \(zarr.json\) is damaged.*--force"):
+    (path / "zarr.json").write_bytes(
+        data := (path / "zarr.json").read_bytes().replace(b'"duration', b'"durative', 1)
+    )
+    with pytest.raises(
+        jm.errors.StoreError, match=r"its description \(zarr.json\) is damaged.*--force"
+    ):
         jm.ensemble(TASK, KEY, resume=True, **given)
     with pytest.raises(jm.errors.StoreError, match="is damaged"):
         jm.ensembles.attributes_of(path)
@@ -108,7 +125,9 @@ def test_a_missing_chunk_is_noticed(tmp_path, kept):
     for file in chunks_of(path):
         data = file.read_bytes()
         file.unlink()
-        with pytest.raises(jm.errors.StoreError, match=rf"1 damaged or missing \({file.relative_to(path)}\)"):
+        with pytest.raises(
+            jm.errors.StoreError, match=rf"1 damaged or missing \({file.relative_to(path)}\)"
+        ):
             jm.ensembles.open_store(path)
         file.write_bytes(data[: len(data) // 2])
         with pytest.raises(jm.errors.StoreError, match="1 damaged or missing"):
@@ -126,7 +145,9 @@ class Broken(Brittle):
 
 @pytest.mark.slow
 def test_a_chunk_of_nothing_but_nan_is_there(tmp_path):
-    task = Broken(noise=jm.OrnsteinUhlenbeckNoise(1.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0))
+    task = Broken(
+        noise=jm.OrnsteinUhlenbeckNoise(1.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0)
+    )
     found = jm.ensemble(task, KEY, seeds=10, store=tmp_path / "a.zarr", **SHORT)
     assert len(json.loads(found.attrs["failed"])) == 10
     assert np.isnan(jm.ensembles.open_store(tmp_path / "a.zarr")["y"][:, 1:]).all()
@@ -144,7 +165,9 @@ def test_what_open_store_refuses(tmp_path):
     with pytest.raises(jm.errors.StoreError, match="there is no store"):
         jm.ensembles.open_store(tmp_path / "a.zarr")
     with pytest.raises(Stop):
-        jm.ensemble(TASK, KEY, seeds=24, store=tmp_path / "a.zarr", progress=stopped_after(1), **SHORT)
+        jm.ensemble(
+            TASK, KEY, seeds=24, store=tmp_path / "a.zarr", progress=stopped_after(1), **SHORT
+        )
     with pytest.raises(jm.errors.StoreError, match="is not complete: resume it"):
         jm.ensembles.open_store(tmp_path / "a.zarr")
 
@@ -157,7 +180,11 @@ def test_a_damaged_store_is_mended_bit_by_bit(tmp_path, kept, parts, caplog):
     path, rng = tmp_path / "a.zarr", random.Random(2)
     given = made(path, kept, parts)
     before = files_of(path)
-    computed = [file for file in before if file.split("/")[0] in ("F_ext", "mean", "quantiles") and "/c/" in file]
+    computed = [
+        file
+        for file in before
+        if file.split("/")[0] in ("F_ext", "mean", "quantiles") and "/c/" in file
+    ]
     files = [rng.choice(computed), "time/c/0", f"{computed[0].split('/')[0]}/zarr.json"]
     (path / files[0]).write_bytes(flipped(before[files[0]], 99))
     (path / files[1]).unlink()
@@ -166,7 +193,10 @@ def test_a_damaged_store_is_mended_bit_by_bit(tmp_path, kept, parts, caplog):
     told = []
     jm.ensemble(TASK, KEY, resume=True, progress=lambda *pace: told.append(pace), **given)
     assert len(told) == (6 if kept else 1)
-    assert f"({files[0]}): to be computed again" in caplog.text and "time/c/0): written again" in caplog.text
+    assert (
+        f"({files[0]}): to be computed again" in caplog.text
+        and "time/c/0): written again" in caplog.text
+    )
     assert files_of(path) == before | {"mine.txt": b"left alone"}
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.zarr"]
 
@@ -176,12 +206,26 @@ def test_the_command_mends(tmp_path, capfd):
     import test_ensemble
 
     path = tmp_path / "a.zarr"
-    arguments = ["ensemble", "zagrodny-slifkin", "--seeds", "16", "--duration", "1", "--chunk", "8", "--out", str(path)]
+    arguments = [
+        "ensemble",
+        "zagrodny-slifkin",
+        "--seeds",
+        "16",
+        "--duration",
+        "1",
+        "--chunk",
+        "8",
+        "--out",
+        str(path),
+    ]
     assert test_ensemble.RUNNER.invoke(app, arguments).exit_code == 0
     before = files_of(path)
     (path / "P_w" / "c" / "1" / "0").unlink()
     merged = test_ensemble.RUNNER.invoke(app, ["merge", str(path)])
-    assert merged.exit_code == 2 and "1 damaged or missing (P_w/c/1/0). Resume" in merged.stderr.replace("\n", " ")
+    assert (
+        merged.exit_code == 2
+        and "1 damaged or missing (P_w/c/1/0). Resume" in merged.stderr.replace("\n", " ")
+    )
     assert test_ensemble.RUNNER.invoke(app, [*arguments, "--resume"]).exit_code == 0
     assert files_of(path) == before
 
@@ -197,8 +241,12 @@ def test_what_is_damaged_before_the_end_is_computed_again(tmp_path, caplog, what
     told = []
     found = jm.ensemble(TASK, KEY, resume=True, progress=lambda *pace: told.append(pace), **given)
     assert len(told) == 6 - 4 + 1
-    assert what == "log" or "1 damaged or missing (F_ext/c/1/0): to be computed again" in caplog.text
-    np.testing.assert_array_equal(found["F_ext"], jm.ensemble(TASK, KEY, seeds=45, control=False, **SHORT).output)
+    assert (
+        what == "log" or "1 damaged or missing (F_ext/c/1/0): to be computed again" in caplog.text
+    )
+    np.testing.assert_array_equal(
+        found["F_ext"], jm.ensemble(TASK, KEY, seeds=45, control=False, **SHORT).output
+    )
 
 
 def test_a_damaged_tally_is_computed_again(tmp_path, monkeypatch, caplog):
@@ -227,7 +275,9 @@ def test_a_damaged_part_is_not_merged(tmp_path, caplog):
     for number in (1, 2):
         jm.ensemble(TASK, KEY, part=(number, 2), **given)
     (path / "F_ext" / "c" / "3" / "0").unlink()
-    with pytest.raises(jm.errors.StoreError, match="1 of 5 chunks are missing: parts 2 of 2 are not done"):
+    with pytest.raises(
+        jm.errors.StoreError, match="1 of 5 chunks are missing: parts 2 of 2 are not done"
+    ):
         jm.ensembles.merge(path)
     (path / "time" / "c" / "0").unlink()
     jm.ensemble(TASK, KEY, part=(2, 2), **given)
@@ -306,13 +356,17 @@ def test_a_second_writer_is_refused(anywhere, kept):
     def meanwhile(text, share):
         for begin in ({"resume": True}, {"overwrite": True}) if not tried else ():
             with pytest.raises(jm.errors.StoreError, match=HERE):
-                jm.ensemble(TASK, jax.random.key(6 if "overwrite" in begin else 5), **begin, **given)
+                jm.ensemble(
+                    TASK, jax.random.key(6 if "overwrite" in begin else 5), **begin, **given
+                )
             tried.append(begin)
 
     found = jm.ensemble(TASK, KEY, progress=meanwhile, **given)
     assert len(tried) == 2 and locks() == []
     whole = jm.ensemble(TASK, KEY, seeds=24, **({"control": False} | SHORT | kept))
-    np.testing.assert_array_equal(found.mean if kept else found["F_ext"], whole.mean if kept else whole.output)
+    np.testing.assert_array_equal(
+        found.mean if kept else found["F_ext"], whole.mean if kept else whole.output
+    )
 
 
 def test_parts_write_together_and_nobody_else(anywhere):
@@ -323,8 +377,11 @@ def test_parts_write_together_and_nobody_else(anywhere):
     def meanwhile(text, share):
         if not tried:
             tried.append(jm.ensemble(TASK, KEY, part=(2, 2), **given))
-            for write in (lambda: jm.ensembles.merge(store), lambda: jm.ensemble(TASK, KEY, part=(1, 2), **given),
-                          lambda: jm.ensemble(TASK, KEY, overwrite=True, **given)):  # fmt: skip
+            for write in (
+                lambda: jm.ensembles.merge(store),
+                lambda: jm.ensemble(TASK, KEY, part=(1, 2), **given),
+                lambda: jm.ensemble(TASK, KEY, overwrite=True, **given),
+            ):
                 with pytest.raises(jm.errors.StoreError, match=HERE):
                     write()
 
@@ -352,13 +409,17 @@ def left_by(store, name, **changes):
     """A lock that a killed process left."""
     data = Holder.here()._replace(**changes).to_bytes()
     if isinstance(store, Path):
-        (store.parent / f".{store.name}.lock{'' if name == 'whole' else '-' + name}").write_bytes(data)
+        (store.parent / f".{store.name}.lock{'' if name == 'whole' else '-' + name}").write_bytes(
+            data
+        )
     else:
         place: Any = place_of(store)
         place.files.pipe_file(f"{place.path}.lock/{name}", data)
 
 
-@pytest.mark.parametrize("changes", [{"pid": 2**22 + 1}, {"started": "7"}, {"boot": "another"}], ids=str)
+@pytest.mark.parametrize(
+    "changes", [{"pid": 2**22 + 1}, {"started": "7"}, {"boot": "another"}], ids=str
+)
 def test_the_lock_of_a_dead_process_is_taken_over(anywhere, caplog, changes):
     """Also where its number was given again, or the machine started anew."""
     store, locks = anywhere
@@ -374,7 +435,10 @@ def test_the_lock_of_another_host_is_not_taken_over(anywhere):
     given: Any = {"seeds": 8, "store": store, **SHORT}
     left_by(store, "whole", host="node17", boot="another", pid=4711)
     for part in ({}, {"part": (1, 1)}):
-        with pytest.raises(jm.errors.StoreError, match=r"process 4711 on node17 .*may still write. If it has ended, remove"):
+        with pytest.raises(
+            jm.errors.StoreError,
+            match=r"process 4711 on node17 .*may still write. If it has ended, remove",
+        ):
             jm.ensemble(TASK, KEY, **part, **given)
     if isinstance(store, Path):
         (store.parent / ".a.zarr.lock").unlink()  # as it says
@@ -382,7 +446,8 @@ def test_the_lock_of_another_host_is_not_taken_over(anywhere):
         place: Any = place_of(store)
         place.files.rm_file(f"{place.path}.lock/whole")
     left_by(store, "part-1", host="node17", boot="another", pid=4711)
-    jm.ensemble(TASK, KEY, part=(1, 1), **given)  # queued again on another node: a part that runs twice does no harm
+    # queued again on another node: a part that runs twice does no harm
+    jm.ensemble(TASK, KEY, part=(1, 1), **given)
     assert locks() == []
     left_by(store, "part-1", host="node17", boot="another", pid=4711)
     with pytest.raises(jm.errors.StoreError, match="process 4711 on node17"):
@@ -411,11 +476,16 @@ def test_a_file_system_without_locks(tmp_path, monkeypatch, caplog):
 
 @pytest.mark.slow
 def test_two_writers_never_give_wrong_numbers(tmp_path, monkeypatch):
-    """A few of the trials of benchmarks/kills.py, which has fifty of more seeds; the second comes within half a second."""
+    """A few of the trials of benchmarks/kills.py, which has fifty of more seeds; the second comes
+    within half a second."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
     import kills
 
-    monkeypatch.setattr(kills, "begun", lambda store, reduce, key=5, **given: Run(store, reduce, key, kills.OPTIONS | given))
+    monkeypatch.setattr(
+        kills,
+        "begun",
+        lambda store, reduce, key=5, **given: Run(store, reduce, key, kills.OPTIONS | given),
+    )
     monkeypatch.setitem(kills.OPTIONS, "seeds", 1600)
     ones, rng = {key: kills.whole(True, key) for key in (5, 6)}, random.Random(4)
     for number in range(4):

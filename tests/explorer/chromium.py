@@ -1,4 +1,5 @@
-"""A headless Chromium, spoken to through a pipe by the DevTools protocol: no driver, no further package, no port."""
+"""A headless Chromium, spoken to through a pipe by the DevTools protocol: no driver, no further
+package, no port."""
 
 import json
 import os
@@ -10,10 +11,19 @@ from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-component-update",
-    "--disable-background-networking", "--disable-sync", "--remote-debugging-pipe", "--hide-scrollbars",
-    "--disable-dev-shm-usage", "--allow-pre-commit-input",
-)  # fmt: skip
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-component-update",
+    "--disable-background-networking",
+    "--disable-sync",
+    "--remote-debugging-pipe",
+    "--hide-scrollbars",
+    "--disable-dev-shm-usage",
+    "--allow-pre-commit-input",
+)
 FOUND = next((path for path in map(shutil.which, NAMES) if path), None)
 
 
@@ -24,7 +34,15 @@ class Browser:
         (self.hear, theirs), (mine, self.tell) = os.pipe(), os.pipe()
         self.profile, self.count, self.events, self.session = tempfile.mkdtemp(), 0, [], None
         line = f'exec "$0" "$@" 3<&{mine} 4>&{theirs}'
-        command = ["bash", "-c", line, FOUND or "chromium", *FLAGS, f"--user-data-dir={self.profile}", "about:blank"]
+        command = [
+            "bash",
+            "-c",
+            line,
+            FOUND or "chromium",
+            *FLAGS,
+            f"--user-data-dir={self.profile}",
+            "about:blank",
+        ]
         self.process = subprocess.Popen(
             command, pass_fds=(mine, theirs), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
@@ -61,7 +79,8 @@ class Browser:
     def open(self, url: str) -> None:
         """Opens a page and waits until it is loaded, its script has run and it is on the screen.
 
-        What is asked before it is loaded would go to the page before it. Keys before it is on the screen would be lost.
+        What is asked before it is loaded would go to the page before it. Keys before it is on the
+        screen would be lost.
         """
         self.send("Page.navigate", url="about:blank")
         loader = self.send("Page.navigate", url=url)["loaderId"]
@@ -71,34 +90,58 @@ class Browser:
 
     def hear_of(self, method: str, **parameters: Any) -> None:
         """Waits until an event with these parameters has come."""
-        while not any(e.get("method") == method and parameters.items() <= e["params"].items() for e in self.events):
+        while not any(
+            e.get("method") == method and parameters.items() <= e["params"].items()
+            for e in self.events
+        ):
             self.events.append(self._next())
 
     def run(self, code: str) -> Any:
         """The value of an expression, waited for if it is a promise."""
-        found = self.send("Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True)
+        found = self.send(
+            "Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True
+        )
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
     def wait(self, code: str) -> None:
         """Until an expression is true."""
-        self.run(f"new Promise((yes) => {{ const look = () => (({code}) ? yes() : setTimeout(look, 20)); look(); }})")
+        self.run(
+            f"new Promise((yes) => {{ const look = () => (({code}) ? yes() : setTimeout(look, 20));"
+            " look(); })"
+        )
 
     def press(self, key: str, times: int = 1) -> None:
         """Keys as a keyboard sends them."""
         for _ in range(times):
             for kind in ("keyDown", "keyUp"):
-                self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=CODES[key])
+                self.send(
+                    "Input.dispatchKeyEvent",
+                    type=kind,
+                    key=key,
+                    code=key,
+                    windowsVirtualKeyCode=CODES[key],
+                )
 
     def screen(self, width: int, height: int, *, dark: bool = False) -> None:
         """The size of the window, and what the reader prefers."""
-        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.send(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
         wanted = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
         self.send("Emulation.setEmulatedMedia", features=wanted)
 
     def requests(self) -> list[str]:
         """What the page has asked for."""
-        return [e["params"]["request"]["url"] for e in self.events if e.get("method") == "Network.requestWillBeSent"]
+        return [
+            e["params"]["request"]["url"]
+            for e in self.events
+            if e.get("method") == "Network.requestWillBeSent"
+        ]
 
     def faults(self) -> list[Any]:
         """Errors that nobody caught."""

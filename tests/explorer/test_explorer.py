@@ -1,7 +1,9 @@
-"""The explorer's page: numbers as in Python, one file, nothing from the network, and what a researcher does with it.
+"""The explorer's page: numbers as in Python, one file, nothing from the network, and what a
+researcher does with it.
 
-Three guards. Everywhere: the table of cases is what Python computes today, and the JavaScript of today reproduced it (its
-digest). With node: JavaScript reproduces the table. With Chromium: the page itself, with keys and files.
+Three guards. Everywhere: the table of cases is what Python computes today, and the JavaScript of
+today reproduced it (its digest). With node: JavaScript reproduces the table. With Chromium: the
+page itself, with keys and files.
 """
 
 import json
@@ -30,14 +32,21 @@ AGAIN = "run `python tests/explorer/cases.py`"
 ROUNDING = 1e-7
 SAME = 1e-6
 # These have all tasks, noises, ways of sampling, the activation and a fading harmonic between them.
-FRESH = ("isometric", "isometric filtered", "isometric white activation", "length", "force elongation", "acceleration",
-         "motion fading")  # fmt: skip
+FRESH = (
+    "isometric",
+    "isometric filtered",
+    "isometric white activation",
+    "length",
+    "force elongation",
+    "acceleration",
+    "motion fading",
+)
 
 
 def test_the_table_has_every_structure_and_is_of_this_code():
-    assert list(STORED["cases"]) == list(cases.STRUCTURES) and {len(c["rows"]) for c in STORED["cases"].values()} == {
-        cases.DRAWS
-    }
+    assert list(STORED["cases"]) == list(cases.STRUCTURES) and {
+        len(c["rows"]) for c in STORED["cases"].values()
+    } == {cases.DRAWS}
     assert STORED["closed_form"] == cases.digest(), f"the page's closed form has changed: {AGAIN}"
     of = {case["table"]["task"] for case in STORED["cases"].values()}
     assert of == set(TASKS)
@@ -65,7 +74,11 @@ def test_javascript_computes_the_table():
 def test_a_fault_is_noticed():
     """What the comparison is worth: powers that are two millionths off."""
     case = STORED["cases"]["isometric"]
-    off = case | {"rows": [row | {"power": [p * (1 + 2 * SAME) for p in row["power"]]} for row in case["rows"]]}
+    off = case | {
+        "rows": [
+            row | {"power": [p * (1 + 2 * SAME) for p in row["power"]]} for row in case["rows"]
+        ]
+    }
     assert cases.by_javascript({"isometric": off})["isometric"] > SAME
 
 
@@ -75,14 +88,21 @@ def test_a_fault_is_noticed():
 def test_the_page_is_one_file_that_asks_for_nothing():
     page = jm.explorer.page()
     assert not re.search(r"https?:|//\w+\.\w|@import|url\((?!#)|fetch\(|XMLHttpRequest|src=", page)
-    assert not re.search(r"^(import|export) ", page, re.MULTILINE) and "/*" not in page.replace("/*JS", "")
+    assert not re.search(r"^(import|export) ", page, re.MULTILINE) and "/*" not in page.replace(
+        "/*JS", ""
+    )
     assert page.count("<script") == page.count("</script>") == 3
 
 
 def test_the_modules_can_be_joined():
-    """Each follows those that it imports, all files are there, and no name of one is a name of another."""
-    assert sorted(f"{name}.mjs" for name in MODULES) == sorted(path.name for path in FOLDER.glob("*.mjs"))
-    declared = re.compile(r"^(?:export )?(?:async )?(?:const|let|function|class) ([\w$]+)", re.MULTILINE)
+    """Each follows those that it imports, all files are there, and no name of one is a name of
+    another."""
+    assert sorted(f"{name}.mjs" for name in MODULES) == sorted(
+        path.name for path in FOLDER.glob("*.mjs")
+    )
+    declared = re.compile(
+        r"^(?:export )?(?:async )?(?:const|let|function|class) ([\w$]+)", re.MULTILINE
+    )
     names: list[str] = []
     for i, module in enumerate(MODULES):
         text = part_of(f"{module}.mjs")
@@ -91,8 +111,12 @@ def test_the_modules_can_be_joined():
         for wanted, other in imported:
             assert other in MODULES[:i], (module, other)
             there = part_of(f"{other}.mjs")
-            known = {*declared.findall(there), *re.findall(r"^  (\w+) = ", there, re.MULTILINE)}  # const one = 1,\n  two = 2
-            assert {one.strip() for one in wanted.split(",") if one.strip()} <= known, (module, other)
+            # const one = 1,\n  two = 2
+            known = {*declared.findall(there), *re.findall(r"^  (\w+) = ", there, re.MULTILINE)}
+            assert {one.strip() for one in wanted.split(",") if one.strip()} <= known, (
+                module,
+                other,
+            )
         names += declared.findall(text)
     assert len(names) == len(set(names))
 
@@ -133,7 +157,10 @@ def explore(*arguments):
 
 def begins_with(path):
     """The state that a page was written with."""
-    (text,) = re.findall(r'<script type="application/json" id="content">(.*)</script>', path.read_text(encoding="utf-8"))
+    (text,) = re.findall(
+        r'<script type="application/json" id="content">(.*)</script>',
+        path.read_text(encoding="utf-8"),
+    )
     return json.loads(text)
 
 
@@ -144,9 +171,16 @@ def test_command_writes_what_it_was_given(tmp_path, monkeypatch):
     assert explore("--out", page).exit_code == 0
     assert begins_with(page) == {} and opened == [page.as_uri()]
     assert explore("--out", page, "--no-open").exit_code == 2
-    assert explore("hamilton-2004", "--out", page, "--no-open", "--force", "--segments", 3).exit_code == 0
+    assert (
+        explore("hamilton-2004", "--out", page, "--no-open", "--force", "--segments", 3).exit_code
+        == 0
+    )
     state = begins_with(page)["state"]
-    assert state["target"]["segments"] == [3] and state["table"]["task"] == "isometric" and len(opened) == 1
+    assert (
+        state["target"]["segments"] == [3]
+        and state["table"]["task"] == "isometric"
+        and len(opened) == 1
+    )
     assert explore("zagrodny-slifkin", "--out", page, "--no-open", "--force").exit_code == 0
     assert begins_with(page)["state"]["table"]["task"] == "prescribed-motion"
     assert "target" not in begins_with(page)["state"]
@@ -172,7 +206,8 @@ def browser():
 
 @pytest.fixture
 def page(browser, tmp_path):
-    """The bundled knee extension, opened; in the end: no uncaught error, and nothing was asked for but files and data."""
+    """The bundled knee extension, opened; in the end: no uncaught error, and nothing was asked for
+    but files and data."""
     target = jm.load_target(TARGET)
     path = tmp_path / "page.html"
     path.write_text(jm.explorer.page(jm.task_for(target), target), encoding="utf-8")
@@ -180,7 +215,12 @@ def page(browser, tmp_path):
     browser.open(path.as_uri())
     yield browser
     assert not browser.faults()
-    assert {url.partition(":")[0] for url in browser.requests()} <= {"file", "data", "blob", "about"}
+    assert {url.partition(":")[0] for url in browser.requests()} <= {
+        "file",
+        "data",
+        "blob",
+        "about",
+    }
 
 
 def power_in(browser):
@@ -196,10 +236,13 @@ def drop(browser, name, text):
     browser.run(f"""(() => {{
         const carried = new DataTransfer();
         carried.items.add(new File([{json.dumps(text)}], {json.dumps(name)}));
-        document.body.dispatchEvent(new DragEvent("drop", {{dataTransfer: carried, bubbles: true, cancelable: true}}));
+        document.body.dispatchEvent(new DragEvent("drop",
+            {{dataTransfer: carried, bubbles: true, cancelable: true}}));
     }})()""")
-    browser.wait(f"document.getElementById('target-name').textContent === {json.dumps(name)} || "
-                 "document.getElementById('message').classList.contains('bad')")  # fmt: skip
+    browser.wait(
+        f"document.getElementById('target-name').textContent === {json.dumps(name)} || "
+        "document.getElementById('message').classList.contains('bad')"
+    )
 
 
 def chi2_of(task, target):
@@ -207,24 +250,31 @@ def chi2_of(task, target):
     moments, _ = jm.response._expected.expected_moments(task, target.settings, (5.0, 15.0))
     at = target.bins - target.settings.first_bin
     power, line = np.asarray(moments.power)[at], np.asarray(moments.line)[at]
-    residual = standardised(target.proportional_power, power / power.sum(), bin_statistics(target, line / power))
+    residual = standardised(
+        target.proportional_power, power / power.sum(), bin_statistics(target, line / power)
+    )
     return np.sum(residual**2) / (residual.size - 1)
 
 
 def test_sliders_move_the_spectrum_as_in_python(page, x64):
-    """With keys alone: the arrows of a focused slider, the Tab key to the number beside it, undo."""
+    """With keys alone: the arrows of a focused slider, the Tab key to the number beside it,
+    undo."""
     target = jm.load_target(TARGET)
     task = jm.task_for(target)
     before = power_in(page)
     np.testing.assert_allclose(before, jm.expected_spectrum(task).power, rtol=SAME)
-    assert page.run("window.explorer.spectrum.chi2") == pytest.approx(chi2_of(task, target), rel=SAME)
+    assert page.run("window.explorer.spectrum.chi2") == pytest.approx(
+        chi2_of(task, target), rel=SAME
+    )
     page.run("document.getElementById('slider-c_w').focus()")
     page.press("ArrowRight", 5)
     value = value_in(page, "c_w")
     assert 60 < value < 63 and page.run("document.activeElement.id") == "slider-c_w"
     moved = task.replace(c_w=value)
     np.testing.assert_allclose(power_in(page), jm.expected_spectrum(moved).power, rtol=SAME)
-    assert page.run("window.explorer.spectrum.chi2") == pytest.approx(chi2_of(moved, target), rel=SAME)
+    assert page.run("window.explorer.spectrum.chi2") == pytest.approx(
+        chi2_of(moved, target), rel=SAME
+    )
     page.press("Tab")
     assert page.run("document.activeElement.id") == "c_w"
     page.run("document.getElementById('undo').click()")
@@ -236,21 +286,34 @@ def test_sliders_move_the_spectrum_as_in_python(page, x64):
 def test_a_dropped_spectrum_is_shown_and_compared(page, tmp_path, x64):
     """On and off the grid, as `load_target` reads it; and what it refuses is refused."""
     random = np.random.default_rng(0)
-    for name, frequency in (("on.csv", jm.SpectrumSettings().frequency), ("off.csv", np.linspace(0.3, 12.0, 40))):
+    for name, frequency in (
+        ("on.csv", jm.SpectrumSettings().frequency),
+        ("off.csv", np.linspace(0.3, 12.0, 40)),
+    ):
         rows = "".join(
-            f"{f:.7g},{p:.6g}\n" for f, p in zip(frequency, random.gamma(4, size=frequency.size) / frequency, strict=True)
+            f"{f:.7g},{p:.6g}\n"
+            for f, p in zip(
+                frequency, random.gamma(4, size=frequency.size) / frequency, strict=True
+            )
         )
         text = "# mine\nfrequency_hz,proportional_power\n" + rows
         (tmp_path / name).write_text(text, encoding="utf-8")
         drop(page, name, text)
         target = jm.load_target(tmp_path / name, segments=12)
         np.testing.assert_allclose(
-            page.run("window.explorer.state.target.proportional_power"), target.proportional_power, rtol=SAME
+            page.run("window.explorer.state.target.proportional_power"),
+            target.proportional_power,
+            rtol=SAME,
         )
         assert page.run("window.explorer.state.target.bins") == target.bins.tolist()
-        assert page.run("document.querySelectorAll('#figure circle.datum').length") >= 2 * target.bins.size
+        assert (
+            page.run("document.querySelectorAll('#figure circle.datum').length")
+            >= 2 * target.bins.size
+        )
         task = jm.task_for(target)
-        assert page.run("window.explorer.spectrum.chi2") == pytest.approx(chi2_of(task, target), rel=SAME)
+        assert page.run("window.explorer.spectrum.chi2") == pytest.approx(
+            chi2_of(task, target), rel=SAME
+        )
     drop(page, "bad.csv", "frequency_hz,proportional_power\n1,0.5\n1,0.6\n")
     assert "line 3" in page.run("document.getElementById('message').textContent")
     table = cases.bare_table(jm.Isometric())
@@ -260,8 +323,12 @@ def test_a_dropped_spectrum_is_shown_and_compared(page, tmp_path, x64):
 
 
 def test_the_saved_preset_and_the_link_hold_what_is_seen(page, tmp_path, x64):
-    page.run("""(() => { for (const id of ["with-activation", "with-tremor"]) document.getElementById(id).click();
-        const box = document.getElementById("k_w"); box.value = "612345.6"; box.dispatchEvent(new Event("change")); })()""")
+    page.run(
+        """(() => { for (const id of ["with-activation", "with-tremor"])
+            document.getElementById(id).click();
+        const box = document.getElementById("k_w"); box.value = "612345.6";
+        box.dispatchEvent(new Event("change")); })()"""
+    )
     page.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     page.run("document.getElementById('save').click()")
     saved = tmp_path / "explored.json"
@@ -270,7 +337,11 @@ def test_the_saved_preset_and_the_link_hold_what_is_seen(page, tmp_path, x64):
         page.run("new Promise((yes) => setTimeout(yes, 25))")
     assert saved.exists(), "the browser has saved nothing in a minute"
     task = jm.load_preset(saved)
-    assert task["k_w"] == 612345.6 and task["activation_time"] == 0.06 and "resonance_width" in task.parameter_names
+    assert (
+        task["k_w"] == 612345.6
+        and task["activation_time"] == 0.06
+        and "resonance_width" in task.parameter_names
+    )
     seen = power_in(page)
     np.testing.assert_allclose(seen, jm.expected_spectrum(task).power, rtol=SAME)
     url = page.run("location.href")
@@ -282,11 +353,13 @@ def test_the_saved_preset_and_the_link_hold_what_is_seen(page, tmp_path, x64):
 
 
 def test_moving_along_what_the_data_do_not_determine(page, x64):
-    """The first direction leaves chi² alone, and the last does not; the information's least strength is that of Python."""
+    """The first direction leaves chi² alone, and the last does not; the information's least
+    strength is that of Python."""
     page.run("window.explorer.findDirections()")
     before, chi2 = power_in(page), page.run("window.explorer.spectrum.chi2")
     slide = """(() => {{ const box = document.getElementById("direction"); box.selectedIndex = {};
-        box.dispatchEvent(new Event("change")); const along = document.getElementById("along"); along.value = 1;
+        box.dispatchEvent(new Event("change"));
+        const along = document.getElementById("along"); along.value = 1;
         along.dispatchEvent(new Event("input")); }})()"""
     page.run(slide.format(0))
     still = page.run("window.explorer.spectrum.chi2")
@@ -298,13 +371,17 @@ def test_moving_along_what_the_data_do_not_determine(page, x64):
 
 def test_traces_have_the_expected_variance(page):
     """Of 30 seeds, nonlinear; their mean variance has a standard error of some 6 %."""
-    found = page.run("""(() => { let sum = 0; const { state, simulate, lowpass, expectedSpectrum } = window.explorer;
+    found = page.run(
+        """(() => { let sum = 0;
+        const { state, simulate, lowpass, expectedSpectrum } = window.explorer;
         for (let seed = 1; seed <= 30; seed++) {
-          const { output } = simulate(state.table, { seed }), seen = lowpass(state.table.settings, output).slice(500, 1500);
+          const { output } = simulate(state.table, { seed });
+          const seen = lowpass(state.table.settings, output).slice(500, 1500);
           const mean = seen.reduce((a, b) => a + b, 0) / 1000;
           sum += seen.reduce((a, x) => a + (x - mean) ** 2, 0) / 1000 / 30;
         }
-        return sum / expectedSpectrum(state.table).variance; })()""")
+        return sum / expectedSpectrum(state.table).variance; })()"""
+    )
     assert abs(found - 1) < 0.25  # the seeds are fixed, so it fails always or never
 
 
@@ -312,11 +389,13 @@ def test_traces_have_the_expected_variance(page):
 def test_the_page_fits_and_every_control_is_named(page, width):
     page.screen(width, 800)
     assert page.run("document.documentElement.scrollWidth") <= width
-    nameless = """[...document.querySelectorAll("input:not([hidden]), select, button")].filter((e) =>
-        !e.labels?.length && !e.getAttribute("aria-label") && !e.textContent.trim()).map((e) => e.id)"""
+    nameless = """[...document.querySelectorAll("input:not([hidden]), select, button")]
+        .filter((e) => !e.labels?.length && !e.getAttribute("aria-label") && !e.textContent.trim())
+        .map((e) => e.id)"""
     assert page.run(nameless) == []
     small = """[...document.querySelectorAll("button, select, input")].filter((e) => {
-        const { width, height } = e.getBoundingClientRect(); return width && height < 17; }).map((e) => e.id)"""
+        const { width, height } = e.getBoundingClientRect();
+        return width && height < 17; }).map((e) => e.id)"""
     assert page.run(small) == []
 
 
@@ -325,12 +404,19 @@ def test_text_stands_out(page, dark):
     """Contrast of text against paper and panel: 4.5 at least (WCAG AA)."""
     page.screen(1280, 900, dark=dark)
     names = ("paper", "panel", "ink", "faint", "model", "line", "data", "run", "bad")
-    code = f"{json.dumps(names)}.map((n) => getComputedStyle(document.documentElement).getPropertyValue('--' + n).trim())"
+    code = (
+        f"{json.dumps(names)}.map((n) =>"
+        " getComputedStyle(document.documentElement).getPropertyValue('--' + n).trim())"
+    )
     colour = dict(zip(names, page.run(code), strict=True))
 
     def light(name):
         parts = np.array([int(colour[name][i : i + 2], 16) / 255 for i in (1, 3, 5)])
-        return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4) @ [0.2126, 0.7152, 0.0722]
+        return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4) @ [
+            0.2126,
+            0.7152,
+            0.0722,
+        ]
 
     for text in names[2:]:
         for under in names[:2]:

@@ -53,7 +53,8 @@ def with_band(share: float, frequency: float = 9.0, width: float = 2.0) -> np.nd
 
 @pytest.mark.slow
 def test_without_harmonic_and_correlation_chi_squared_has_its_distribution(x64):
-    """Gaussian log powers of known spread, three nearly flat priors: chi² with 30 - 1 - 3 degrees of freedom."""
+    """Gaussian log powers of known spread, three nearly flat priors: chi² with 30 - 1 - 3 degrees
+    of freedom."""
     free = ("c_w", "noise_K_w", "noise_K_z")
     sigma = 0.05 * own_power()
     rng = np.random.default_rng(1)
@@ -84,7 +85,9 @@ def test_what_the_fitted_directions_take_up_is_removed():
     residual = rng.standard_normal(12)
     solution = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
     np.testing.assert_allclose(left @ residual, residual - jacobian @ solution, atol=1e-12)
-    np.testing.assert_allclose(without_fitted(np.column_stack([jacobian, jacobian[:, 0]])), left, atol=1e-12)
+    np.testing.assert_allclose(
+        without_fitted(np.column_stack([jacobian, jacobian[:, 0]])), left, atol=1e-12
+    )
 
 
 @pytest.mark.slow
@@ -103,7 +106,8 @@ def test_a_line_in_the_bins_is_that_of_a_sine(x64):
 
 @pytest.mark.slow
 def test_p_is_uniform_about_the_models_own_spectra():
-    """Of few and of many segments; benchmarks/verdict.py has 500 of each and of 12, docs/fitting.md what came out."""
+    """Of few and of many segments; benchmarks/verdict.py has 500 of each and of 12, docs/fitting.md
+    what came out."""
     count = 12
     made = [drawn(segments, seed) for segments in (3, 60) for seed in range(count)]
     with without_intervals():
@@ -111,7 +115,9 @@ def test_p_is_uniform_about_the_models_own_spectra():
     p = np.array([result.adequacy_p for result in results]).reshape(2, count)
     for each in p:
         # Exceeded once in 10 000 times: 0.60, where 30 spectra have 0.39.
-        assert scipy.stats.kstest(each, "uniform").statistic < scipy.stats.kstwo.ppf(1 - 1e-4, count)
+        assert scipy.stats.kstest(each, "uniform").statistic < scipy.stats.kstwo.ppf(
+            1 - 1e-4, count
+        )
     # The mean of 24 uniform numbers, as seldom: 0.23.
     assert abs(p.mean() - 0.5) < scipy.stats.norm.isf(0.5e-4) / np.sqrt(12 * p.size)
 
@@ -126,7 +132,8 @@ def missed() -> jm.fits.FitResult:
 
 @pytest.mark.slow
 def test_a_band_of_tremor_is_found_and_named():
-    """A line of zero width is no tremor: ten percent of the power at 9 Hz, 2 Hz wide, in 60 segments."""
+    """A line of zero width is no tremor: ten percent of the power at 9 Hz, 2 Hz wide, in 60
+    segments."""
     result = missed()
     assert result.success and result.adequate is False and result.adequacy_p <= 0.002
     assert result.verdict.startswith("does not describe the data: chi2 per bin ")
@@ -137,7 +144,8 @@ def test_a_band_of_tremor_is_found_and_named():
 
 
 def test_a_single_bin_beside_the_run_is_named_with_its_own_sign(x64):
-    """Five bins each three standard deviations above, one below: whether that one is said depends on its size alone."""
+    """Five bins each three standard deviations above, one below: whether that one is said depends
+    on its size alone."""
     frequency, plan = SETTINGS.frequency, planned(TASK, drawn(60, 3), FitOptions())
     objective, run = plan.problem.linear(), slice(18, 23)
 
@@ -147,7 +155,8 @@ def test_a_single_bin_beside_the_run_is_named_with_its_own_sign(x64):
         return _misfit(plan.problem, objective, residuals, np.eye(len(residuals)))
 
     said = (
-        f"the data have more power than the model from {frequency[18]:.2g} to {frequency[22]:.2g} Hz (6.7 standard errors)"
+        f"the data have more power than the model from {frequency[18]:.2g} to {frequency[22]:.2g}"
+        " Hz (6.7 standard errors)"
     )
     assert words(-4.0) == f"{said}, and less at {frequency[5]:.2g} Hz"
     assert words(4.0) == f"{said}, and more at {frequency[5]:.2g} Hz"
@@ -164,15 +173,22 @@ def test_a_run_has_no_bin_that_is_clearly_off_the_other_way(x64):
         residuals[15:20] = 3.1, 3.0, between, 3.0, 3.0
         return _misfit(plan.problem, objective, residuals, np.eye(len(residuals)))
 
-    assert f"more power than the model from {frequency[15]:.2g} to {frequency[19]:.2g} Hz" in words(-0.9)
-    assert f"more power than the model from {frequency[15]:.2g} to {frequency[16]:.2g} Hz" in words(-1.9)
+    assert f"more power than the model from {frequency[15]:.2g} to {frequency[19]:.2g} Hz" in words(
+        -0.9
+    )
+    assert f"more power than the model from {frequency[15]:.2g} to {frequency[16]:.2g} Hz" in words(
+        -1.9
+    )
 
 
 @pytest.mark.slow
 def test_errors_of_such_a_fit_are_widened_and_its_harmonic_is_not_judged():
     result = missed()
     factor = result.adequacy.widening
-    assert factor == pytest.approx(np.sqrt(result.adequacy.chi2 / result.adequacy.expected)) and factor > 1.3
+    assert (
+        factor == pytest.approx(np.sqrt(result.adequacy.chi2 / result.adequacy.expected))
+        and factor > 1.3
+    )
     with jax.enable_x64(True):
         problem = planned(TASK, result.target, FitOptions()).problem
         theta = problem.theta_of((result.task,))
@@ -181,7 +197,8 @@ def test_errors_of_such_a_fit_are_widened_and_its_harmonic_is_not_judged():
         g = ended.found.slopes[0]["high_frequency_floor"]
         plain = float(np.sqrt(g @ ended.covariance @ g))
         found = ended.intervals(["high_frequency_floor", "c_w"])
-    assert ended.intervals(["c_w"]) == {"c_w": found["c_w"]}  # kept: in single precision it would be another
+    # kept: in single precision it would be another
+    assert ended.intervals(["c_w"]) == {"c_w": found["c_w"]}
     # The fit takes the line's share of the bins from the stage before its last.
     assert result.derived["high_frequency_floor"].stderr == pytest.approx(factor * plain, rel=0.01)
     assert result.harmonic_p_value is None
@@ -190,7 +207,8 @@ def test_errors_of_such_a_fit_are_widened_and_its_harmonic_is_not_judged():
 
 @pytest.mark.slow
 def test_what_was_measured_is_as_certain_as_its_measurement():
-    """The mean and its error are data. That the spectrum is missed widens the other errors, not this one."""
+    """The mean and its error are data. That the spectrum is missed widens the other errors, not
+    this one."""
     given, error = missed().derived["mean"].value, 0.02
     result = jm.fit(TASK, missed().target, mean_force=(given, error), rungs=0, **QUICK)
     assert result.adequate is False and result.adequacy.widening > 1.3
@@ -231,13 +249,16 @@ def test_a_faint_harmonic_has_no_errors_and_a_strong_one_has(x64):
         problem = plan.problem
         theta = problem.theta_of((task,))
         objective = problem.linear()
-        shares[amplitude] = elsewhere(Endpoint(problem, objective, expand(objective, theta[None]).row(0)))
+        shares[amplitude] = elsewhere(
+            Endpoint(problem, objective, expand(objective, theta[None]).row(0))
+        )
     assert shares[0.003] > 0.5 and shares[0.05] < 1e-3
 
 
 @pytest.mark.slow
 def test_an_interval_ends_where_the_profile_says(x64):
-    """Against scipy's constrained minimum of the same cost, for the noise that one target and two parameters allow."""
+    """Against scipy's constrained minimum of the same cost, for the noise that one target and two
+    parameters allow."""
     from scipy.optimize import minimize_scalar
 
     free = ("c_w", "noise_K_z")
@@ -261,20 +282,26 @@ def test_an_interval_ends_where_the_profile_says(x64):
     for end in (ends.low, ends.high):
         assert end is not None
         held = theta[0] + end
-        rest = minimize_scalar(lambda b, held=held: cost(np.array([held, b])), bracket=(theta[1] - 0.3, theta[1] + 0.3))
+        rest = minimize_scalar(
+            lambda b, held=held: cost(np.array([held, b])), bracket=(theta[1] - 0.3, theta[1] + 0.3)
+        )
         assert rest.fun - cost(theta) == pytest.approx(1.96**2, rel=0.05)
     assert ends.about(2.0)[1] == pytest.approx(2.0 * np.exp(ends.high))
 
 
 @pytest.mark.slow
 def test_one_criterion_for_a_parameter_and_for_what_is_the_same_number():
-    """C_w0 = c_w v_ref²: with the rest known both have an error, of the same size in percent; else neither."""
+    """C_w0 = c_w v_ref²: with the rest known both have an error, of the same size in percent; else
+    neither."""
     known = {n: float(TASK[n]) for n in DEFAULT_FREE if n != "c_w"}
     result = jm.fit(TASK, drawn(30, 6), fix=known, **QUICK)
     a, b = result.parameters["c_w"], result.derived["C_w0"]
     assert a.stderr is not None and b.stderr is not None
     assert a.stderr / a.value == pytest.approx(b.stderr / b.value)
-    assert result.parameters["k_w"].identifiable is None and result.derived["K_w0"].identifiable is None
+    assert (
+        result.parameters["k_w"].identifiable is None
+        and result.derived["K_w0"].identifiable is None
+    )
     full = jm.fit(TASK, drawn(30, 6), **QUICK)
     assert full.parameters["c_w"].stderr is None and full.derived["C_w0"].stderr is None
     assert full.products and all(" " in name or name in full.parameters for name in full.products)
@@ -284,7 +311,9 @@ def test_one_criterion_for_a_parameter_and_for_what_is_the_same_number():
 
 
 def test_a_mean_force_that_nothing_can_reach_is_refused():
-    with pytest.raises(ValueError, match=r"mean_force = 120 N cannot be reached.*P_w = 5 N.*at_force\(task, 120\)"):
+    with pytest.raises(
+        ValueError, match=r"mean_force = 120 N cannot be reached.*P_w = 5 N.*at_force\(task, 120\)"
+    ):
         jm.fit(TASK, drawn(12, 1), mean_force=(120.0, 3.0))
 
 
@@ -298,7 +327,8 @@ def test_a_mean_force_in_newtons_is_met_by_the_carried_muscle():
 
 @pytest.mark.slow
 def test_a_mean_force_that_the_spectrum_contradicts_is_said():
-    """Stiffnesses held: the mean is 2.2 N whatever the noise, 20 stated errors from what is asked."""
+    """Stiffnesses held: the mean is 2.2 N whatever the noise, 20 stated errors from what is
+    asked."""
     held = {n: float(TASK[n]) for n in ("k_w", "k_z")}
     result = jm.fit(TASK, drawn(12, 1), fix=held, mean_force=(3.0, 0.04), rungs=0, **QUICK)
     assert abs(result.only.further["mean"]) > 3
@@ -307,12 +337,22 @@ def test_a_mean_force_that_the_spectrum_contradicts_is_said():
 
 @pytest.mark.slow
 def test_the_active_force_may_be_free_with_a_prior_in_ratio():
-    """The muscle's own mean is 2.2 N at P_w = 5 N; 4 N asks for about 9 N with the stiffnesses held."""
+    """The muscle's own mean is 2.2 N at P_w = 5 N; 4 N asks for about 9 N with the stiffnesses
+    held."""
     held = {n: float(TASK[n]) for n in ("k_w", "k_z")}
-    result = jm.fit(TASK, drawn(12, 1), free=("P_w", "noise_K_w", "noise_K_z", "c_w"), mean_force=(4.0, 0.02), **QUICK)
+    result = jm.fit(
+        TASK,
+        drawn(12, 1),
+        free=("P_w", "noise_K_w", "noise_K_z", "c_w"),
+        mean_force=(4.0, 0.02),
+        **QUICK,
+    )
     assert held and result.derived["mean"].value == pytest.approx(4.0, abs=0.1)
     said = " ".join(str(result).split())
-    assert "held fixed: m_w = 0.5 kg, m_z = 0.5 kg, x_ref_w = 20 mm, x_ref_z = 20 mm. They are no measurements" in said
+    assert (
+        "held fixed: m_w = 0.5 kg, m_z = 0.5 kg, x_ref_w = 20 mm, x_ref_z = 20 mm. They are no"
+        " measurements" in said
+    )
     assert result.parameters["P_w"].value > 8
 
 
@@ -322,7 +362,9 @@ def test_quantities_that_are_observed_are_those_of_the_fit():
     with jax.enable_x64(True):
         problem = planned(TASK, result.target, FitOptions()).problem
         objective = problem.linear()
-        values = quantities(objective, expand(objective, problem.theta_of((result.task,))[None]))[0][0]
+        values = quantities(objective, expand(objective, problem.theta_of((result.task,))[None]))[
+            0
+        ][0]
     for name, p in result.derived.items():
         assert p.value == pytest.approx(float(values[name][0]), rel=1e-9), name
         if p.interval is not None:
@@ -339,10 +381,12 @@ def test_the_power_in_bands_has_intervals():
     assert all((p.interval is None) == (p.stderr is None) for p in bands)
     band, floor = (result.derived[name] for name in ("band_8_12", "high_frequency_floor"))
     frequency, fitted = result.target.frequency, result.fitted
-    share = (frequency[19] + 0.5 * frequency[0] - 8) / frequency[0]  # of bin 20, whose upper edge is at 8.008 Hz
+    # of bin 20, whose upper edge is at 8.008 Hz
+    share = (frequency[19] + 0.5 * frequency[0] - 8) / frequency[0]
     bins = 10 + share * fitted[19] / np.mean(fitted[20:])
     assert band.value == pytest.approx(bins * floor.value, rel=1e-9)
-    # Along the interval the ratio of bin 20 to the floor moves by a few per cent, its 2 % of the band by less than 1e-3.
+    # Along the interval the ratio of bin 20 to the floor moves by a few per cent, its 2 % of the
+    # band by less than 1e-3.
     assert np.array(band.interval) == pytest.approx(bins * np.array(floor.interval), rel=1e-3)
     columns = result.to_dataframe().set_index("quantity")[["low", "high"]]
     assert tuple(columns.loc["band_8_12"]) == band.interval

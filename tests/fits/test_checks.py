@@ -1,4 +1,5 @@
-"""When a fit counts as converged, and how far its spectrum lies from the linear response: against scipy and NumPy."""
+"""When a fit counts as converged, and how far its spectrum lies from the linear response: against
+scipy and NumPy."""
 
 import numpy as np
 import pytest
@@ -21,17 +22,22 @@ def cost_of(residuals, prior, theta):
 def told(residuals, jacobian, prior, theta, known=DETERMINED, settled=False):
     cost = cost_of(residuals, prior, theta)
     final = Minima(theta[None], np.array([cost]), np.array([64]), np.array([settled]))
-    return convergence(final, residuals, jacobian, prior, theta, known, (Start(cost, False, 64),), 64)
+    return convergence(
+        final, residuals, jacobian, prior, theta, known, (Start(cost, False, 64),), 64
+    )
 
 
 @pytest.fixture
 def quadratic():
-    """Residuals that are linear in θ, where a fit stopped, and the step to its minimum by NumPy's least squares."""
+    """Residuals that are linear in θ, where a fit stopped, and the step to its minimum by NumPy's
+    least squares."""
     rng = np.random.default_rng(11)
     jacobian, residuals = rng.standard_normal((12, 3)), 5 * rng.standard_normal(12)
     prior, theta = np.array([1.0, 2.0, 0.5]), np.array([0.3, -0.4, 0.8])
     whole = np.concatenate([jacobian, np.diag(np.sqrt(prior))])
-    step = np.linalg.lstsq(whole, -np.concatenate([residuals, np.sqrt(prior) * theta]), rcond=None)[0]
+    step = np.linalg.lstsq(whole, -np.concatenate([residuals, np.sqrt(prior) * theta]), rcond=None)[
+        0
+    ]
     return residuals, jacobian, prior, theta, step
 
 
@@ -47,8 +53,11 @@ def test_what_a_further_step_would_gain_is_said(quadratic):
 
 def test_a_fit_at_its_minimum_has_converged(quadratic):
     residuals, jacobian, prior, theta, step = quadratic
-    for share, converged in ((1.0, True), (0.999, True), (0.5, False)):  # of the step to the minimum
-        success, message = told(residuals + share * jacobian @ step, jacobian, prior, theta + share * step)
+    # of the step to the minimum
+    for share, converged in ((1.0, True), (0.999, True), (0.5, False)):
+        success, message = told(
+            residuals + share * jacobian @ step, jacobian, prior, theta + share * step
+        )
         assert success is converged and ("converged: 1 of 1 starts" in message) is converged, share
 
 
@@ -64,13 +73,18 @@ def test_a_step_along_what_the_data_do_not_determine_is_no_failure():
 
 
 def test_the_linear_response_against_fresh_seeds():
-    """Deviations from the mean over the seeds, with scipy's standard error of a mean; in logarithms over the bins' sd."""
+    """Deviations from the mean over the seeds, with scipy's standard error of a mean; in logarithms
+    over the bins' sd."""
     rng = np.random.default_rng(12)
     expected, sd = np.array([3.0, 2.0, 1.0]), np.array([0.3, 0.2, 0.25])
     each = expected * (1.1 + 0.2 * rng.standard_normal((5, 3)))
-    found = linear_check(each, expected, BinStatistics(np.zeros(3), sd, np.eye(3), np.ones(3), True))
+    found = linear_check(
+        each, expected, BinStatistics(np.zeros(3), sd, np.eye(3), np.ones(3), True)
+    )
     off = each.mean(axis=0) / expected - 1
     assert found["seeds"] == 5
     assert found["largest_deviation"] == pytest.approx(np.max(np.abs(off)))
-    assert found["largest_deviation_se"] == pytest.approx(np.max(np.abs(off * expected) / scipy.stats.sem(each)))
+    assert found["largest_deviation_se"] == pytest.approx(
+        np.max(np.abs(off * expected) / scipy.stats.sem(each))
+    )
     assert found["largest_deviation_sd"] == pytest.approx(np.max(np.abs(np.log(1 + off)) / sd))

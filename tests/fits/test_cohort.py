@@ -1,4 +1,5 @@
-"""Cohorts: many targets at once are each what a fit alone gives, differences of groups have honest intervals."""
+"""Cohorts: many targets at once are each what a fit alone gives, differences of groups have honest
+intervals."""
 
 import functools
 import io
@@ -25,22 +26,39 @@ PEOPLE, SEEDS = 6, 20
 
 
 def person(number):
-    """Two groups that differ in the rhythm's frequency; within a group its frequency and the damping vary."""
+    """Two groups that differ in the rhythm's frequency; within a group its frequency and the
+    damping vary."""
     rng = np.random.default_rng(number)
     old = number % 2
     return jm.Isometric().replace(
-        c_w=60 * np.exp(0.1 * rng.normal()), harmonic_frequency=4.5 + 2 * old + 0.2 * rng.normal(), harmonic_amplitude=0.012
+        c_w=60 * np.exp(0.1 * rng.normal()),
+        harmonic_frequency=4.5 + 2 * old + 0.2 * rng.normal(),
+        harmonic_amplitude=0.012,
     )
 
 
 @functools.cache
 def people():
-    """Absolute spectra averaged over seeds of the nonlinear simulator; six Welch segments of each."""
+    """Absolute spectra averaged over seeds of the nonlinear simulator; six Welch segments of
+    each."""
     targets = []
     for number in range(PEOPLE):
-        runs = jm.ensemble(jm.settled(person(number)), jax.random.key(100 + number), seeds=SEEDS, dt=2.5e-3, control=False)
+        runs = jm.ensemble(
+            jm.settled(person(number)),
+            jax.random.key(100 + number),
+            seeds=SEEDS,
+            dt=2.5e-3,
+            control=False,
+        )
         power = np.asarray(runs.spectrum().mean().proportional)
-        targets.append(jm.Target(f"person{number}", power, segments=(6,) * SEEDS, mvc_fraction=0.1 + 0.1 * (number // 2)))
+        targets.append(
+            jm.Target(
+                f"person{number}",
+                power,
+                segments=(6,) * SEEDS,
+                mvc_fraction=0.1 + 0.1 * (number // 2),
+            )
+        )
     return targets
 
 
@@ -52,7 +70,9 @@ SHARES: list[float] = []
 
 @functools.cache
 def cohort():
-    return jm.fit_cohort(people(), groups=GROUPS, starts=16, progress=lambda _text, share: SHARES.append(share))
+    return jm.fit_cohort(
+        people(), groups=GROUPS, starts=16, progress=lambda _text, share: SHARES.append(share)
+    )
 
 
 @pytest.mark.slow
@@ -64,12 +84,16 @@ def test_what_the_data_determine_is_recovered():
     for number, result in enumerate(found.results.values()):
         with jax.enable_x64(True):
             truth = true_derived(person(number))
-        assert abs(result.derived["harmonic_frequency"].value - truth["harmonic_frequency"]) < 0.25 * 0.390625
+        assert (
+            abs(result.derived["harmonic_frequency"].value - truth["harmonic_frequency"])
+            < 0.25 * 0.390625
+        )
         for name in ("corner_frequency", "harmonic_share", "high_frequency_floor"):
             estimate = result.derived[name]
             assert estimate.stderr is not None
             deviations.append((estimate.value - truth[name]) / estimate.stderr)
-    # Šidák bound at 1 % for 18 comparisons, and their spread: its square is a mean of 18, correlated within a person.
+    # Šidák bound at 1 % for 18 comparisons, and their spread: its square is a mean of 18,
+    # correlated within a person.
     assert np.abs(deviations).max() < 3.45
     assert np.sqrt(np.mean(np.square(deviations))) < 1.8
 
@@ -81,7 +105,8 @@ def test_each_target_is_fitted_as_if_alone():
     together = cohort().results["person3"]
     for name, estimate in alone.derived.items():
         if estimate.stderr is not None:
-            # Alone, the nonlinear correction moves the answer, and it settles within a thousandth of the cost.
+            # Alone, the nonlinear correction moves the answer, and it settles within a thousandth
+            # of the cost.
             assert abs(together.derived[name].value - estimate.value) < 0.2 * estimate.stderr, name
             # the simulated seeds of a fit alone are part of its error
             assert together.derived[name].stderr == pytest.approx(estimate.stderr, rel=0.2), name
@@ -94,7 +119,12 @@ def test_groups_differ_by_what_they_were_given():
     assert (d.a, d.b, d.unit, d.basis, d.members) == ("young", "old", "Hz", "people", (3, 3))
     assert 1.0 < d.low < d.difference < d.high < 3.0
     values = [
-        [r.derived["harmonic_frequency"].value for n, r in cohort().results.items() if GROUPS[n] == g] for g in (d.b, d.a)
+        [
+            r.derived["harmonic_frequency"].value
+            for n, r in cohort().results.items()
+            if GROUPS[n] == g
+        ]
+        for g in (d.b, d.a)
     ]
     interval = scipy.stats.ttest_ind(*values, equal_var=False).confidence_interval(0.95)
     np.testing.assert_allclose((d.low, d.high), (interval.low, interval.high), rtol=1e-12)
@@ -115,14 +145,20 @@ def test_a_member_says_what_was_not_done():
 
 def test_the_verdict_names_what_is_missed_and_what_cannot_be_judged():
     def verdict(*fits: tuple[bool, bool | None]) -> str:
-        results = {f"t{i}": SimpleNamespace(success=found, adequate=fine) for i, (found, fine) in enumerate(fits)}
+        results = {
+            f"t{i}": SimpleNamespace(success=found, adequate=fine)
+            for i, (found, fine) in enumerate(fits)
+        }
         return jm.fits.CohortResult.verdict.fget(SimpleNamespace(results=results))
 
     assert verdict((True, True), (True, True)) == "the model describes 2 of 2 targets"
-    assert verdict((True, True), (True, False), (True, None)) == (
-        "the model describes 1 of 2 targets; it does not describe t1, whose errors are widened"
+    assert (
+        verdict((True, True), (True, False), (True, None))
+        == "the model describes 1 of 2 targets; it does not describe t1, whose errors are widened"
     )
-    assert verdict((True, None), (False, None)).startswith("whether the model describes the targets cannot be judged")
+    assert verdict((True, None), (False, None)).startswith(
+        "whether the model describes the targets cannot be judged"
+    )
     assert verdict((False, None)) == verdict() == "no target could be fitted"
 
 
@@ -137,7 +173,9 @@ def test_the_figure(by):
     figure = cohort().plot(by)
     try:
         if by == "person":
-            assert {ax.get_xlim() for ax in figure.axes if ax.get_ylabel()} == {(-0.5, PEOPLE - 0.5)}
+            assert {ax.get_xlim() for ax in figure.axes if ax.get_ylabel()} == {
+                (-0.5, PEOPLE - 0.5)
+            }
         assert {ax.get_ylabel().replace("\n", " ") for ax in figure.axes} >= {
             "harmonic frequency (Hz)",
             "corner frequency (Hz)",
@@ -148,7 +186,9 @@ def test_the_figure(by):
 
 def made_cohort(**groups):
     result = made_result()
-    return jm.fits.CohortResult({name: result for name in groups}, {name: g for name, g in groups.items() if g}, {})
+    return jm.fits.CohortResult(
+        {name: result for name in groups}, {name: g for name, g in groups.items() if g}, {}
+    )
 
 
 def test_tables_hold_every_quantity_of_every_target():
@@ -162,21 +202,35 @@ def test_tables_hold_every_quantity_of_every_target():
     for row in rows:
         here = data.sel(target=row["target"], quantity=row["quantity"])
         assert float(here["value"]) == row["value"] and str(here["unit"].item()) == row["unit"]
-        assert np.isnan(here["stderr"]) if row["stderr"] is None else float(here["stderr"]) == row["stderr"]
+        assert (
+            np.isnan(here["stderr"])
+            if row["stderr"] is None
+            else float(here["stderr"]) == row["stderr"]
+        )
         for end in ("low", "high"):
             assert np.isnan(here[end]) if row[end] is None else float(here[end]) == row[end]
     corner = next(row for row in rows if row["quantity"] == "corner_frequency")
     assert (corner["low"], corner["high"]) == made_result().derived["corner_frequency"].interval
     table = found.to_dataframe()
-    assert list(table["value"]) == [row["value"] for row in rows] and list(table.columns) == list(rows[0])
+    assert list(table["value"]) == [row["value"] for row in rows] and list(table.columns) == list(
+        rows[0]
+    )
 
 
 @pytest.mark.parametrize("whose", ["", "@a"])
 def test_a_tremor_is_listed_once_by_the_name_that_people_use(whose):
     frequency, width = Estimate(9.0, "Hz", 0.3), Estimate(2.0, "Hz", None, True, False)
     result = made_result(
-        parameters={f"resonance_frequency{whose}": frequency, f"resonance_width{whose}": width, "c_w": Estimate(60.0, "N")},
-        derived={f"tremor_frequency{whose}": frequency, f"tremor_width{whose}": width, "mean": Estimate(2.5, "N")},
+        parameters={
+            f"resonance_frequency{whose}": frequency,
+            f"resonance_width{whose}": width,
+            "c_w": Estimate(60.0, "N"),
+        },
+        derived={
+            f"tremor_frequency{whose}": frequency,
+            f"tremor_width{whose}": width,
+            "mean": Estimate(2.5, "N"),
+        },
     )
     names = [f"{name}{whose}" for name in ("tremor_frequency", "tremor_width")]
     assert list(result.found) == ["c_w", *names, "mean"]
@@ -191,7 +245,9 @@ def test_single_members_are_compared_by_their_standard_errors():
     for d in differences:
         error = next(r["stderr"] for r in found.table() if r["quantity"] == d.quantity)
         assert (d.basis, d.difference, d.members) == ("fits", 0.0, (1, 1))
-        np.testing.assert_allclose((d.low, d.high), np.array([-1, 1]) * 1.959964 * np.sqrt(2) * error, rtol=1e-6)
+        np.testing.assert_allclose(
+            (d.low, d.high), np.array([-1, 1]) * 1.959964 * np.sqrt(2) * error, rtol=1e-6
+        )
 
 
 @pytest.mark.slow
@@ -241,7 +297,9 @@ def test_a_figure_needs_a_known_way_and_levels():
 
 def command(*arguments):
     result = CliRunner().invoke(app, ["fit", *map(str, arguments)], env={"COLUMNS": "200"})
-    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(
+        result.exception
+    )
     return result
 
 
@@ -250,15 +308,28 @@ def test_the_command_writes_a_folder_for_each_and_the_table(tmp_path):
     groups = tmp_path / "groups.csv"
     groups.write_text("target,group\nvastus-lateralis-26mvc,knee\nfdi-abduction-45mvc,finger\n")
     out = tmp_path / "out"
-    result = command("vastus-lateralis-26mvc", "fdi-abduction-45mvc", tmp_path / "none.csv", "--groups", groups,
-                     "--starts", 8, "--out", out)  # fmt: skip
+    result = command(
+        "vastus-lateralis-26mvc",
+        "fdi-abduction-45mvc",
+        tmp_path / "none.csv",
+        "--groups",
+        groups,
+        "--starts",
+        8,
+        "--out",
+        out,
+    )
     assert result.exit_code == 2 and "none.csv: no such file" in result.stderr
     for name in ("vastus-lateralis-26mvc", "fdi-abduction-45mvc"):
         assert jm.load_result(out / name / "fit.json").success
         assert (out / name / "fit.png").stat().st_size > 0
     rows = (out / "cohort.csv").read_text().splitlines()
     assert rows[0].startswith("target,group,quantity,value,stderr,low,high,unit,determined")
-    assert (out / "differences.csv").read_text().startswith("quantity,a,b,difference,low,high,unit,basis")
+    assert (
+        (out / "differences.csv")
+        .read_text()
+        .startswith("quantity,a,b,difference,low,high,unit,basis")
+    )
     assert (out / "cohort.png").stat().st_size > 0
 
 
@@ -275,13 +346,21 @@ def test_the_command_writes_a_folder_for_each_and_the_table(tmp_path):
 def test_bad_groups(text, message, tmp_path):
     path = tmp_path / "groups.csv"
     path.write_text(text)
-    result = command("vastus-lateralis-26mvc", "fdi-abduction-45mvc", "--groups", path, "--out", tmp_path / "out")
+    result = command(
+        "vastus-lateralis-26mvc", "fdi-abduction-45mvc", "--groups", path, "--out", tmp_path / "out"
+    )
     assert result.exit_code == 2 and message in result.stderr
 
 
 def test_groups_and_seeds_do_not_go_with_everything(tmp_path):
     path = tmp_path / "groups.csv"
     path.write_text("target,group\na,b\n")
-    assert "--groups compares several spectra" in command("fdi-abduction-45mvc", "--groups", path).stderr
+    assert (
+        "--groups compares several spectra"
+        in command("fdi-abduction-45mvc", "--groups", path).stderr
+    )
     both = command("fdi-abduction-45mvc", "vastus-lateralis-26mvc", "--seeds", 8)
-    assert both.exit_code == 2 and "leave out --method, --seeds, --increments and --quick" in both.stderr
+    assert (
+        both.exit_code == 2
+        and "leave out --method, --seeds, --increments and --quick" in both.stderr
+    )

@@ -1,4 +1,5 @@
-"""Fits: the objective against plain simulation, gradients, recovery of known truths, and what happens when it fails."""
+"""Fits: the objective against plain simulation, gradients, recovery of known truths, and what
+happens when it fails."""
 
 import functools
 from typing import Any
@@ -40,9 +41,13 @@ from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
 
-PERTURBATION = "all amplitudes of noise and harmonic can be multiplied by one number, and the fit stays as good"
+PERTURBATION = (
+    "all amplitudes of noise and harmonic can be multiplied by one number, and the fit stays as"
+    " good"
+)
 MECHANICS = (
-    "all stiffness and damping can be multiplied by one number, and the fit stays as good: at most their ratios are known"
+    "all stiffness and damping can be multiplied by one number, and the fit stays as good: at most"
+    " their ratios are known"
 )
 HALF_BIN = 0.390625 / 2
 VASTUS = jm.load_target("vastus-lateralis-26mvc")
@@ -56,13 +61,25 @@ def simple_target(**fields: Any) -> jm.Target:
     return jm.Target("hump", power / power.sum(), **{"segments": 12, **fields})
 
 
-def setup_of(task, target, free, *, residual="log", extra=(None, None), seeds=8, key=0, control=False):
+def setup_of(
+    task, target, free, *, residual="log", extra=(None, None), seeds=8, key=0, control=False
+):
     """What `fit` makes of its arguments, for one objective without a search. Needs float64."""
     values = {name: float(task[name]) for name in free}
     coordinates = Coordinates.of(values, {}, {name: PARAMETERS[name].prior_sd for name in free})
     part = Part("", task, target, coordinates, tuple(range(len(free))), *extra)
-    return FitProblem((part,), coordinates, np.ones(len(free)), residual, "montecarlo", DT, jax.random.key(key), seeds,
-                      control, lambda text, share: None)  # fmt: skip
+    return FitProblem(
+        (part,),
+        coordinates,
+        np.ones(len(free)),
+        residual,
+        "montecarlo",
+        DT,
+        jax.random.key(key),
+        seeds,
+        control,
+        lambda text, share: None,
+    )
 
 
 def part_of(problem, seeds=8):
@@ -82,7 +99,14 @@ def part_of(problem, seeds=8):
         {"detrend": "none", "window": "hamming"},
         {"detrend": "linear", "overlap": 0.25},
         {"filter_cutoff": None, "first_bin": 0, "last_bin": 128},
-        {"rate": 50.0, "length": 100, "filter_cutoff": 20.0, "filter_order": 4, "window": "boxcar", "overlap": 0.29},
+        {
+            "rate": 50.0,
+            "length": 100,
+            "filter_cutoff": 20.0,
+            "filter_order": 4,
+            "window": "boxcar",
+            "overlap": 0.29,
+        },
         {"window": "dpss", "tapers": 3, "detrend": "linear"},
     ],
 )
@@ -111,9 +135,14 @@ def test_welch_operator_refuses_a_window_shorter_than_a_segment():
     "task",
     [
         jm.Isometric(
-            noise=jm.BandLimitedNoise() + jm.ResonantNoise(0.02), settings=jm.SpectrumSettings(sampling="filtered")
+            noise=jm.BandLimitedNoise() + jm.ResonantNoise(0.02),
+            settings=jm.SpectrumSettings(sampling="filtered"),
         ),
-        jm.PrescribedForce(noise=jm.OrnsteinUhlenbeckNoise(), F_ext=2.0, settings=jm.SpectrumSettings(sampling="average")),
+        jm.PrescribedForce(
+            noise=jm.OrnsteinUhlenbeckNoise(),
+            F_ext=2.0,
+            settings=jm.SpectrumSettings(sampling="average"),
+        ),
     ],
     ids=["isometric", "force"],
 )
@@ -122,8 +151,13 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task):
     """But for the cross term of line and noise, whose expectation is zero."""
     key, seeds, dt = jax.random.key(3), 16, 2.5e-3
     runs = jm.ensemble(task, key, seeds=seeds, dt=dt)
-    still = {name: 0.0 for name in task.parameter_names if name.startswith(("noise_K", "noise_C", "resonance_amplitude"))}
-    quiet = np.asarray(jm.ensemble(task.replace(**still), key, seeds=seeds, dt=dt).output)[0]  # by the same program
+    still = {
+        name: 0.0
+        for name in task.parameter_names
+        if name.startswith(("noise_K", "noise_C", "resonance_amplitude"))
+    }
+    # by the same program
+    quiet = np.asarray(jm.ensemble(task.replace(**still), key, seeds=seeds, dt=dt).output)[0]
     grid = Grid(dt, 6000, 4, runs.substeps)
     chosen = np.array([0, 3, 10, 29])
     model = MonteCarlo.of(task.settings, key, seeds, grid, chosen, WINDOW, control=False)
@@ -138,29 +172,43 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task):
     np.testing.assert_allclose(moments.line, line, rtol=1e-9, atol=1e-13 * line.max())
     np.testing.assert_allclose(moments.power, line + random.mean(axis=0), rtol=1e-9)
     np.testing.assert_allclose(moments.mean, output[:, 500:1500].mean(), rtol=1e-12)
-    passed, still = (scipy.signal.sosfilt(task.settings.sections, x)[..., 500:1500] for x in (output - quiet, quiet))
+    passed, still = (
+        scipy.signal.sosfilt(task.settings.sections, x)[..., 500:1500]
+        for x in (output - quiet, quiet)
+    )
     variance = still.var() + passed.var(axis=1).mean()
     np.testing.assert_allclose(moments.variance, variance, rtol=1e-9)
     cross = powers(output) - line - random
-    references.assert_standard_normal(cross.mean(axis=0) / (cross.std(axis=0, ddof=1) / np.sqrt(seeds)))
+    references.assert_standard_normal(
+        cross.mean(axis=0) / (cross.std(axis=0, ddof=1) / np.sqrt(seeds))
+    )
     assert np.isclose(float(moments.variation), np.sqrt(variance) / abs(output[:, 500:1500].mean()))
     np.testing.assert_allclose(moments.proportional, moments.power / moments.power.sum())
 
 
 # --- coordinates
 
-NATURAL = {"c_w": 60.0, "F_ext": -2.0, "harmonic_frequency": 4.25, "noise_K_w": 0.15, "harmonic_phase": 0.3}
+NATURAL = {
+    "c_w": 60.0,
+    "F_ext": -2.0,
+    "harmonic_frequency": 4.25,
+    "noise_K_w": 0.15,
+    "harmonic_phase": 0.3,
+}
 BOUNDS = {"F_ext": (-3.0, 5.0), "noise_K_w": (0.0, 0.5), "c_w": (10.0, np.inf)}
 
 
 def coordinates(values=None, bounds=None):
     values = NATURAL if values is None else values
-    return Coordinates.of(values, BOUNDS if bounds is None else bounds, {n: PARAMETERS[n].prior_sd for n in values})
+    return Coordinates.of(
+        values, BOUNDS if bounds is None else bounds, {n: PARAMETERS[n].prior_sd for n in values}
+    )
 
 
 @functools.cache
 def compiled_theta():
-    """Of coordinates without bounds of their own; compiled, as hypothesis calls it a hundred times."""
+    """Of coordinates without bounds of their own; compiled, as hypothesis calls it a hundred
+    times."""
     return jax.jit(lambda s: coordinates(bounds={}).theta(s))
 
 
@@ -179,17 +227,28 @@ def test_theta_counts_standard_deviations_of_the_prior(x64):
     values = coordinates().values(jnp.full(len(NATURAL), 0.5))
     for name, value in NATURAL.items():
         row = PARAMETERS[name]
-        expected = value * np.exp(0.5 * row.prior_sd) if row.positive else value + 0.5 * row.prior_sd
+        expected = (
+            value * np.exp(0.5 * row.prior_sd) if row.positive else value + 0.5 * row.prior_sd
+        )
         np.testing.assert_allclose(values[name], expected, rtol=1e-14)
 
 
 def test_a_frequency_with_a_prior_of_its_own_comes_back():
-    """A grid of frequencies is laid in coordinates: half a standard deviation of 0.2 in the log is `exp(0.1)`."""
-    made = Coordinates(("c_w", "harmonic_frequency"), np.array([60.0, 6.0]), np.array([1.0, 0.2]), np.array([True, True]),
-                       np.full(2, -np.inf), np.full(2, np.inf))  # fmt: skip
+    """A grid of frequencies is laid in coordinates: half a standard deviation of 0.2 in the log is
+    `exp(0.1)`."""
+    made = Coordinates(
+        ("c_w", "harmonic_frequency"),
+        np.array([60.0, 6.0]),
+        np.array([1.0, 0.2]),
+        np.array([True, True]),
+        np.full(2, -np.inf),
+        np.full(2, np.inf),
+    )
     found = made.theta_of("harmonic_frequency", 6.0 * np.exp([0.0, 0.1]))
     np.testing.assert_allclose(found, [0.0, 0.5], atol=1e-14)
-    np.testing.assert_allclose(made.values_of(np.array([[0.0, 0.5]]))[0, 1], 6.0 * np.exp(0.1), rtol=1e-14)
+    np.testing.assert_allclose(
+        made.values_of(np.array([[0.0, 0.5]]))[0, 1], 6.0 * np.exp(0.1), rtol=1e-14
+    )
 
 
 @pytest.mark.slow
@@ -206,7 +265,9 @@ def test_from_theta_is_the_reverse_of_theta(theta):
 def test_bounds_hold_wherever_the_coordinates_go(s):
     with jax.enable_x64(True):
         values = compiled_values()(np.array(s))
-        bounds = {name: (PARAMETERS[name].fit_lower, PARAMETERS[name].fit_upper) for name in NATURAL} | BOUNDS
+        bounds = {
+            name: (PARAMETERS[name].fit_lower, PARAMETERS[name].fit_upper) for name in NATURAL
+        } | BOUNDS
         for name, (low, high) in bounds.items():
             slack = 1e-12 * abs(float(values[name]))  # rounding of log and exp
             assert low - slack <= float(values[name]) <= high + slack
@@ -223,7 +284,9 @@ def test_starts_outside_the_bounds_are_clipped_into_them(theta):
 
 @pytest.mark.parametrize(("size", "count"), [(1, 1), (8, 100), (20, 32)])
 def test_halton_points_are_scipys_to_the_last_bit(size, count):
-    np.testing.assert_array_equal(halton(size, count), scipy.stats.qmc.Halton(size, rng=0).random(count))
+    np.testing.assert_array_equal(
+        halton(size, count), scipy.stats.qmc.Halton(size, rng=0).random(count)
+    )
 
 
 def test_slope_is_the_derivative_of_the_values(x64):
@@ -238,7 +301,11 @@ def test_slope_is_the_derivative_of_the_values(x64):
     ("values", "bounds", "message"),
     [
         ({"noise_K_w": 0.0}, {}, "noise_K_w = 0.0 cannot be fitted: it is fitted in log space"),
-        ({"c_w": 60.0}, {"c_w": (1.0, 50.0)}, r"c_w = 60.0 N s\^3/m\^3 must lie inside its bounds \(1.0, 50.0\)"),
+        (
+            {"c_w": 60.0},
+            {"c_w": (1.0, 50.0)},
+            r"c_w = 60.0 N s\^3/m\^3 must lie inside its bounds \(1.0, 50.0\)",
+        ),
         ({"c_w": 60.0}, {"c_w": (100.0, 50.0)}, "must lie inside its bounds"),
         ({"harmonic_frequency": 40.0}, {}, r"must lie inside its bounds \(0.2, 30.0\)"),
     ],
@@ -282,12 +349,15 @@ class Direct(eqx.Module):
 
 
 class Curved(Direct):
-    """Residuals of a narrow curved valley with its minimum, 1/8, at (1, 1); not finite for s_0 < -1.5."""
+    """Residuals of a narrow curved valley with its minimum, 1/8, at (1, 1); not finite for s_0 <
+    -1.5."""
 
     scale: float = 10.0
 
     def moments(self, theta):
-        valley = jnp.stack([self.scale * (theta[1] - theta[0] ** 2), 1 - theta[0], 0.5 * jnp.ones_like(theta[0])])
+        valley = jnp.stack(
+            [self.scale * (theta[1] - theta[0] ** 2), 1 - theta[0], 0.5 * jnp.ones_like(theta[0])]
+        )
         return valley * jnp.where(theta[0] < -1.5, jnp.nan, 1.0)
 
 
@@ -299,14 +369,16 @@ def test_descent_finds_the_minimum_from_every_start_but_a_bad_one(x64):
     reports = []
     starts = np.array([[-1.0, 1.0], [np.nan, 0.0], [2.0, 2.0], [-2.0, 0.0]])
     found = least_squares(Curved(), starts, 80, report=watch(reports))
-    # Settled means that a thousandth of the cost is left to gain: half a squared distance of 1/8000.
+    # Settled means that a thousandth of the cost is left to gain: half a squared distance of
+    # 1/8000.
     np.testing.assert_allclose(found.cost[[0, 2]], 0.125, rtol=1e-3)
     np.testing.assert_allclose(found.s[[0, 2], 0], 1.0, atol=0.02)
     assert np.all(found.settled[[0, 2]]) and not np.any(found.settled[[1, 3]])
     assert np.all(~np.isfinite(found.cost[[1, 3]]))
     assert found.best in (0, 2)
     assert len(reports) == found.steps.max() < 80
-    assert found.steps[1] < found.steps[2] < found.steps[0]  # each counts until it has settled or given up
+    # each counts until it has settled or given up
+    assert found.steps[1] < found.steps[2] < found.steps[0]
 
 
 def test_a_step_to_where_the_model_explodes_is_rejected(x64):
@@ -349,7 +421,9 @@ def test_residuals_and_their_slopes_are_exact_where_the_model_was_seen(x64):
     seen = expand(objective, s)
     for i, point in enumerate(jnp.asarray(s)):
         here = jax.tree.map(lambda x, i=i: x[i], seen)
-        np.testing.assert_allclose(_residuals(point, (objective, None, here))[0], objective.moments(point), rtol=1e-14)
+        np.testing.assert_allclose(
+            _residuals(point, (objective, None, here))[0], objective.moments(point), rtol=1e-14
+        )
         slope = jax.jacfwd(lambda s, here=here: _residuals(s, (objective, None, here))[0])(point)
         np.testing.assert_allclose(slope, jax.jacfwd(objective.moments)(point), rtol=1e-14)
 
@@ -362,14 +436,17 @@ FREE = ("c_w", "noise_K_w", "harmonic_frequency")
 @functools.cache
 def _problem(residual, extra=(None, None)):
     with jax.enable_x64(True):
-        return setup_of(jm.Isometric(), simple_target(), FREE, residual=residual, extra=extra).montecarlo(8)
+        return setup_of(
+            jm.Isometric(), simple_target(), FREE, residual=residual, extra=extra
+        ).montecarlo(8)
 
 
 EXTRA, AT = ((np.log(0.02), 0.1), (2.0, 0.1)), np.array([0.2, -0.1, 0.05])
 
 
 def _at(theta):
-    """The model of all these objectives, by one program: residuals of every kind follow from its moments."""
+    """The model of all these objectives, by one program: residuals of every kind follow from its
+    moments."""
     return expand(_problem("log", EXTRA), np.asarray(theta)[None]).row(0)
 
 
@@ -393,9 +470,12 @@ def test_gradients_of_the_residuals_are_differences(x64, residual):
 
     forward = jax.jit(jax.jacfwd(lambda s: _residuals(s, (objective, objective.data, seen))[0]))(s)
     h = 1e-4
-    central = np.stack([(evaluate(s + h * e) - evaluate(s - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
+    central = np.stack(
+        [(evaluate(s + h * e) - evaluate(s - h * e)) / (2 * h) for e in np.eye(3)], axis=1
+    )
     assert np.all(np.isfinite(forward))
-    # Truncation h² times the third derivative, which for a line crossing a bin is up to 1e2 of the slope.
+    # Truncation h² times the third derivative, which for a line crossing a bin is up to 1e2 of the
+    # slope.
     np.testing.assert_allclose(forward, central, rtol=1e-5, atol=1e-5 * np.abs(central).max())
     bins = 29 if residual == "cumulative" else 30
     assert forward.shape == (bins + 2 + 3, 3)
@@ -403,7 +483,8 @@ def test_gradients_of_the_residuals_are_differences(x64, residual):
 
 @pytest.mark.slow
 def test_slopes_that_were_seen_are_those_of_the_whole(x64):
-    """Every batch of points has one program for moments and slopes; here the residuals are differentiated in one piece."""
+    """Every batch of points has one program for moments and slopes; here the residuals are
+    differentiated in one piece."""
     objective, s, seen = _problem("log", EXTRA), jnp.asarray(AT), _seen()
 
     def whole(s):
@@ -411,7 +492,8 @@ def test_slopes_that_were_seen_are_those_of_the_whole(x64):
         return objective.residuals(theta, (objective.parts[0].moments(theta),), objective.data)
 
     forward = jax.jit(jax.jacfwd(lambda s: _residuals(s, (objective, objective.data, seen))[0]))(s)
-    # Normals have single precision, which two programs round differently: 6e-8 of each of thousands.
+    # Normals have single precision, which two programs round differently: 6e-8 of each of
+    # thousands.
     np.testing.assert_allclose(forward, at_once(jax.jacfwd(whole), s), rtol=1e-6, atol=6e-8)
 
 
@@ -447,11 +529,14 @@ def test_linear_and_cumulative_residuals_are_in_standard_deviations(x64):
     n = 256 + 11 * 128
     density = np.interp(np.fft.rfftfreq(8 * n, 0.01), target.frequency, target.proportional_power)
     x = np.fft.irfft(np.fft.rfft(rng.standard_normal((500, 8 * n))) * np.sqrt(density))[:, :n]
-    power = np.asarray(jm.spectra.spectrum_of(x, target.settings.replace(filter_cutoff="none")).power)
+    power = np.asarray(
+        jm.spectra.spectrum_of(x, target.settings.replace(filter_cutoff="none")).power
+    )
     p = power / power.sum(axis=1, keepdims=True)
     for kind, value in (("linear", p), ("cumulative", np.cumsum(p, axis=1))):
         ratio = value.std(axis=0) / residual_sigma(kind, target, statistics)
-        # A linear theory of shares whose largest has a relative error of 0.3, of bins that are not quite flat.
+        # A linear theory of shares whose largest has a relative error of 0.3, of bins that are not
+        # quite flat.
         np.testing.assert_allclose(ratio[:-1], 1.0, atol=0.25)
 
 
@@ -463,7 +548,8 @@ def null_sentences(task, extra):
 
 @pytest.mark.slow
 def test_the_measured_variation_fixes_the_scale(x64):
-    """Design 8: both null directions are named, and a coefficient of variation takes the first away."""
+    """Design 8: both null directions are named, and a coefficient of variation takes the first
+    away."""
     without = null_sentences(jm.Isometric(), (None, None))
     assert {PERTURBATION, MECHANICS} <= set(without)
     variation = target_variation(VASTUS)
@@ -475,17 +561,31 @@ def test_the_measured_variation_fixes_the_scale(x64):
 
 @pytest.mark.slow
 def test_stiff_points_get_substeps(x64):
-    """c_w / m_w = 4000/s: λ dt = 10 on the grid of the fit, which Heun's method does not survive."""
+    """c_w / m_w = 4000/s: λ dt = 10 on the grid of the fit, which Heun's method does not
+    survive."""
     problem = setup_of(jm.Isometric().replace(c_w=2000.0), simple_target(), ("c_w", "k_w"))
     objective = problem.montecarlo(8)
     assert objective.parts[0].model.grid.substeps == 1
     finer = problem.finer(objective, np.zeros((1, 2)))
     assert finer.parts[0].model.grid.substeps == 16
-    assert problem.finer(finer, np.array([[-5.0, 0.0]])).parts[0].model.grid.substeps == 16  # never fewer again
-    assert problem.finer(objective, np.array([[-5.0, 0.0], [np.nan, 0.0]])).parts[0].model.grid.substeps == 1
-    assert problem.finer(objective, np.array([[-5.0, 0.0], [0.0, 0.0]])).parts[0].model.grid.substeps == 16
-    assert np.all(np.isfinite(at_once(lambda theta: finer.parts[0].moments(theta).power, jnp.zeros(2))))
-    assert not np.all(np.isfinite(at_once(lambda theta: objective.parts[0].moments(theta).power, jnp.zeros(2))))
+    # never fewer again
+    assert problem.finer(finer, np.array([[-5.0, 0.0]])).parts[0].model.grid.substeps == 16
+    assert (
+        problem.finer(objective, np.array([[-5.0, 0.0], [np.nan, 0.0]]))
+        .parts[0]
+        .model.grid.substeps
+        == 1
+    )
+    assert (
+        problem.finer(objective, np.array([[-5.0, 0.0], [0.0, 0.0]])).parts[0].model.grid.substeps
+        == 16
+    )
+    assert np.all(
+        np.isfinite(at_once(lambda theta: finer.parts[0].moments(theta).power, jnp.zeros(2)))
+    )
+    assert not np.all(
+        np.isfinite(at_once(lambda theta: objective.parts[0].moments(theta).power, jnp.zeros(2)))
+    )
 
 
 # --- arguments
@@ -496,7 +596,9 @@ def test_the_task_follows_from_the_quantity():
     assert isinstance(force, jm.Isometric) and force.settings == VASTUS.settings
     assert isinstance(jm.task_for(simple_target(quantity="torque")), jm.Isometric)
     moved = jm.task_for(simple_target(quantity="displacement"), noise="ornstein-uhlenbeck")
-    assert isinstance(moved, jm.PrescribedForce) and isinstance(moved.noise, jm.OrnsteinUhlenbeckNoise)
+    assert isinstance(moved, jm.PrescribedForce) and isinstance(
+        moved.noise, jm.OrnsteinUhlenbeckNoise
+    )
     felt = simple_target(quantity="acceleration")
     assert moved.quantity == "displacement" and jm.task_for(felt).quantity == "acceleration"
     assert jm.task_for(felt, jm.PrescribedForce).quantity == "acceleration"
@@ -505,31 +607,48 @@ def test_the_task_follows_from_the_quantity():
 
 def test_an_acceleration_is_fitted_as_one():
     felt, free = simple_target(quantity="acceleration"), ("c_w",)
-    with pytest.raises(ValueError, match="target 'hump' is an acceleration, but its task PrescribedForce gives x_z in m"):
+    with pytest.raises(
+        ValueError,
+        match="target 'hump' is an acceleration, but its task PrescribedForce gives x_z in m",
+    ):
         jm.fit(jm.PrescribedForce(), felt, free=free)
-    with pytest.raises(ValueError, match="target 'hump' is a force, but its task PrescribedForce gives a_z in m/s"):
+    with pytest.raises(
+        ValueError, match="target 'hump' is a force, but its task PrescribedForce gives a_z in m/s"
+    ):
         jm.fit(jm.task_for(felt), simple_target(), free=free)
     with pytest.raises(ValueError, match="the mean of an acceleration is zero; leave it out"):
         jm.fit(jm.task_for(felt), felt, free=free, mean_force=(1.0, 0.1))
 
 
 def test_white_noise_works_where_the_output_does_not_contain_it():
-    with pytest.raises(ValueError, match=r"WhiteNoise on K_z cannot be used in Isometric.*BandLimitedNoise.*noise_K_z"):
+    with pytest.raises(
+        ValueError,
+        match=r"WhiteNoise on K_z cannot be used in Isometric.*BandLimitedNoise.*noise_K_z",
+    ):
         with_noise(jm.Isometric(), "white")
     with pytest.raises(ValueError, match="WhiteNoise on C_z"):
         with_noise(jm.Isometric(), "white", {"noise_K_z": 0.0})
-    task = with_noise(jm.Isometric(), "white", {"noise_K_z": 0.0, "noise_C_z": 0.0, "noise_K_w": 0.2})
+    task = with_noise(
+        jm.Isometric(), "white", {"noise_K_z": 0.0, "noise_C_z": 0.0, "noise_K_w": 0.2}
+    )
     assert isinstance(task.noise, jm.WhiteNoise)
-    np.testing.assert_array_equal(task.noise.amplitude, [0.2, 0.0, PARAMETERS["noise_C_w"].default, 0.0])
+    np.testing.assert_array_equal(
+        task.noise.amplitude, [0.2, 0.0, PARAMETERS["noise_C_w"].default, 0.0]
+    )
     assert "noise_K_z" not in free_names(task, None, {"noise_K_z": 0.0}, VASTUS)
 
 
 def test_free_by_default():
     assert free_names(jm.Isometric(), None, {}, VASTUS) == DEFAULT_FREE
     ornstein = jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise())
-    assert free_names(ornstein, None, {"k_w": 1.0}, VASTUS) == (*DEFAULT_FREE[1:], "noise_correlation_time")
+    assert free_names(ornstein, None, {"k_w": 1.0}, VASTUS) == (
+        *DEFAULT_FREE[1:],
+        "noise_correlation_time",
+    )
     # What is zero cannot be fitted in log space and stays.
-    assert "harmonic_amplitude" not in free_names(jm.Isometric().replace(harmonic_amplitude=0.0), None, {}, VASTUS)
+    assert "harmonic_amplitude" not in free_names(
+        jm.Isometric().replace(harmonic_amplitude=0.0), None, {}, VASTUS
+    )
 
 
 @pytest.mark.parametrize(
@@ -548,7 +667,10 @@ def test_free_by_default():
         ({"fix": {"m_w": -1.0}}, "m_w = -1.0 kg is outside"),
         ({"free": ["c_w"], "priors": {"k_w": 1.0}}, "priors: .*'k_w'"),
         ({"free": ["c_w"], "bounds": {"k_w": (1.0, 2.0)}}, "bounds: .*'k_w'"),
-        ({"free": ["c_w"], "bounds": {"c_w": (1.0, 2.0)}}, "c_w = 60.0 .* must lie inside its bounds"),
+        (
+            {"free": ["c_w"], "bounds": {"c_w": (1.0, 2.0)}},
+            "c_w = 60.0 .* must lie inside its bounds",
+        ),
         ({"increments": "strong"}, r"increments = 'strong': .*gaussian.*weak"),
         ({"dt": 3e-3}, "dt = 0.003 s does not divide the sampling interval 0.01"),
     ],
@@ -564,14 +686,21 @@ def test_a_task_that_does_not_fluctuate():
     with pytest.raises(ValueError, match="neither noise nor a harmonic"):
         jm.fit(still, simple_target(), free=("c_w",), **QUICK)
     result = jm.fit(still.replace(noise_C_w=0.01), simple_target(), free=("c_w",), **QUICK)
-    assert not result.success and "noise on damping alone does nothing when nothing moves" in result.message
-    with pytest.raises(ValueError, match=r"harmonic_frequency = 60.0 Hz is not below half the sampling rate"):
+    assert (
+        not result.success
+        and "noise on damping alone does nothing when nothing moves" in result.message
+    )
+    with pytest.raises(
+        ValueError, match=r"harmonic_frequency = 60.0 Hz is not below half the sampling rate"
+    ):
         jm.fit(jm.Isometric(), simple_target(), fix={"harmonic_frequency": 60.0}, **QUICK)
 
 
 def test_fewer_bins_than_parameters():
     few = jm.Target("few", np.full(5, 0.2), bins=np.arange(1, 6), segments=12)
-    with pytest.raises(ValueError, match=r"5 bins cannot determine 8 free parameters \(k_w, .*fix some"):
+    with pytest.raises(
+        ValueError, match=r"5 bins cannot determine 8 free parameters \(k_w, .*fix some"
+    ):
         jm.fit(jm.Isometric(), few)
 
 
@@ -579,8 +708,10 @@ def test_fewer_bins_than_parameters():
 
 
 def averaged(task, *, seeds=192, key=99):
-    """The target that averaging the absolute spectra of many seeds gives; none of them is used by the fit."""
-    runs = jm.ensemble(jm.settled(task), jax.random.key(key), seeds=seeds, chunk=64)  # the program of a fit's check
+    """The target that averaging the absolute spectra of many seeds gives; none of them is used by
+    the fit."""
+    # the program of a fit's check
+    runs = jm.ensemble(jm.settled(task), jax.random.key(key), seeds=seeds, chunk=64)
     power = np.asarray(runs.spectrum().mean().proportional)
     return jm.Target("truth", power, segments=[6] * seeds)
 
@@ -589,29 +720,45 @@ _derived = eqx.filter_jit(derived)
 
 
 def true_derived(task):
-    """Derived quantities of the truth, its spectrum with a control variate: each seed is worth hundreds."""
-    runs, quiet = (jm.ensemble(jm.settled(t), jax.random.key(7), seeds=64) for t in (task, references.quiet(task)))
+    """Derived quantities of the truth, its spectrum with a control variate: each seed is worth
+    hundreds."""
+    runs, quiet = (
+        jm.ensemble(jm.settled(t), jax.random.key(7), seeds=64)
+        for t in (task, references.quiet(task))
+    )
     line = quiet.spectrum().power[0]
     held = np.asarray(runs.between())
-    seen = runs.mean_spectrum().power, line, held.mean(), held.var(axis=1).mean(), slowest_rate(task)
+    seen = (
+        runs.mean_spectrum().power,
+        line,
+        held.mean(),
+        held.var(axis=1).mean(),
+        slowest_rate(task),
+    )
     moments = Moments(*map(jnp.asarray, seen))
     return {name: float(value) for name, value in _derived(as_arrays(task), moments).items()}
 
 
 def off(task, free):
     """The task with its free parameters half as large again or two thirds as large."""
-    return task.replace(**{name: float(task[name]) * (1.5 if i % 2 else 1 / 1.5) for i, name in enumerate(free)})
+    return task.replace(
+        **{name: float(task[name]) * (1.5 if i % 2 else 1 / 1.5) for i, name in enumerate(free)}
+    )
 
 
 def assert_recovered(result, task, determined, free=()):
-    """The harmonic frequency, and within three standard errors all derived quantities and `free` that have one.
+    """The harmonic frequency, and within three standard errors all derived quantities and `free`
+    that have one.
 
     Those in `determined` must have one.
     """
     assert result.success, result.message
     nearest = np.argmin(np.abs(result.frequency_hz - float(task["harmonic_frequency"])))
     assert result.harmonic_share[nearest] >= 0.8
-    assert abs(result.parameters["harmonic_frequency"].value - float(task["harmonic_frequency"])) < HALF_BIN / 2
+    assert (
+        abs(result.parameters["harmonic_frequency"].value - float(task["harmonic_frequency"]))
+        < HALF_BIN / 2
+    )
     known = {**result.parameters, **result.derived}
     truth = true_derived(task) | {name: float(task[name]) for name in free}
     for name in {*DERIVED, "corner_frequency", *free}:
@@ -621,17 +768,20 @@ def assert_recovered(result, task, determined, free=()):
 
 
 DERIVED = ("harmonic_frequency", "harmonic_share", "high_frequency_floor")
-# Where a noise amplitude is hardly seen (noise_K_z = 0.005, say) its estimate may fall to zero, where the linear theory
-# behind the standard errors ends; these are seen.
+# Where a noise amplitude is hardly seen (noise_K_z = 0.005, say) its estimate may fall to zero,
+# where the linear theory behind the standard errors ends; these are seen.
 FIRST = jm.Isometric().replace(harmonic_amplitude=0.03, noise_K_z=0.012)
-SECOND = jm.Isometric().replace(harmonic_amplitude=0.03, harmonic_frequency=7.2, c_w=100.0, noise_K_z=0.008)
+SECOND = jm.Isometric().replace(
+    harmonic_amplitude=0.03, harmonic_frequency=7.2, c_w=100.0, noise_K_z=0.008
+)
 RECOVERY: dict[str, Any] = {"starts": BATCH, "seeds": 64, "key": 1, "rungs": 0}
 
 
 @pytest.mark.parametrize("task", [FIRST, SECOND], ids=["first", "second"])
 @pytest.mark.slow
 def test_what_the_data_determine_is_recovered(x64, task):
-    """Eight free parameters; the stated errors of single ones hold only as far as the model is linear.
+    """Eight free parameters; the stated errors of single ones hold only as far as the model is
+    linear.
 
     Of a displacement the same is seen in `test_joint`.
     """
@@ -653,12 +803,16 @@ def test_three_free_parameters_are_recovered(x64, task):
 
 
 FEW = ("c_w", "noise_K_w")
-SIMULATED: dict[str, Any] = {"free": FREE, "starts": 4, "seeds": 16, "check_seeds": 16}  # one program for all such fits
+# one program for all such fits
+SIMULATED: dict[str, Any] = {"free": FREE, "starts": 4, "seeds": 16, "check_seeds": 16}
 
 
 @pytest.mark.parametrize(
     ("method", "reason"),
-    [("linear", "the fitted task cannot be simulated"), ("montecarlo", "none of the starts gives a finite spectrum")],
+    [
+        ("linear", "the fitted task cannot be simulated"),
+        ("montecarlo", "none of the starts gives a finite spectrum"),
+    ],
 )
 @pytest.mark.slow
 def test_a_model_that_explodes_everywhere_is_a_result(x64, method, reason):
@@ -682,10 +836,17 @@ def literal():
 def test_without_linear_response_only_monte_carlo_fits():
     with pytest.raises(jm.errors.OperatingPointError, match="undamped: eigenvalues"):
         jm.fit(literal(), simple_target(), free=("k_w", "noise_K_w"), **QUICK)
-    found = jm.fit(literal(), simple_target(), free=("k_w", "noise_K_w"), method="montecarlo",
-                   **QUICK | {"starts": 1, "seeds": 8}, max_steps=1, dt=1.25e-3)  # fmt: skip
-    # Later steps lead to where simulations explode. One program for all: a search begins with 8 seeds, and no point that is
-    # seen is so stiff that it asks for more steps than these.
+    found = jm.fit(
+        literal(),
+        simple_target(),
+        free=("k_w", "noise_K_w"),
+        method="montecarlo",
+        **QUICK | {"starts": 1, "seeds": 8},
+        max_steps=1,
+        dt=1.25e-3,
+    )
+    # Later steps lead to where simulations explode. One program for all: a search begins with 8
+    # seeds, and no point that is seen is so stiff that it asks for more steps than these.
     assert np.all(np.isfinite(found.fitted)) and len(found.starts) == 1
     assert found.profile is None and found.check == {}
 
@@ -714,8 +875,13 @@ def test_one_failing_start_does_not_stop_the_others(monkeypatch):
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_fit():
-    first, again = quick_fit(), jm.fit(jm.Isometric(), simple_target(), free=FEW, key=jax.random.key(0), **QUICK)
-    assert {n: p.value for n, p in again.parameters.items()} == {n: p.value for n, p in first.parameters.items()}
+    first, again = (
+        quick_fit(),
+        jm.fit(jm.Isometric(), simple_target(), free=FEW, key=jax.random.key(0), **QUICK),
+    )
+    assert {n: p.value for n, p in again.parameters.items()} == {
+        n: p.value for n, p in first.parameters.items()
+    }
     np.testing.assert_array_equal(again.fitted, first.fitted)
     assert first.seed == 0 and again.seed is None
 
@@ -733,7 +899,14 @@ def test_a_fit_is_in_double_precision_whatever_the_callers():
 @pytest.mark.slow
 def test_progress_is_told_up_to_the_end():
     told = []
-    found = jm.fit(jm.Isometric(), simple_target(), free=FEW, key=0, progress=lambda *a: told.append(a), **QUICK)
+    found = jm.fit(
+        jm.Isometric(),
+        simple_target(),
+        free=FEW,
+        key=0,
+        progress=lambda *a: told.append(a),
+        **QUICK,
+    )
     held = found.derived["harmonic_frequency"]  # it follows from what is fixed alone
     assert not held.free and held.stderr is None and held.identifiable is None
     shares = [share for _, share in told]
@@ -782,15 +955,19 @@ def test_the_answer_comes_before_the_checks_and_an_interruption_in_them_keeps_it
     assert kept.success and kept.parameters == found.parameters
     assert not found.stretch[0].size and found.harmonic_p_value is None
     assert [n for n in kept.notices if n not in found.notices] == [
-        "not done: the check by new simulations, the test of other frequencies of the harmonic, and its p-value. "
-        "--quick (check_seeds=0) leaves these out, and so does an interruption"
+        "not done: the check by new simulations, the test of other frequencies of the harmonic, and"
+        " its p-value. --quick (check_seeds=0) leaves these out, and so does an interruption"
     ]
     # The checks change no estimate, but for the spectrum's own numbers, which they simulate.
     whole, quick = jm.fit(jm.Isometric(), simple_target(), **given), found
     assert whole.parameters == quick.parameters and "seeds" in whole.check
     answers = []
-    unchecked = jm.fit(jm.Isometric(), simple_target(), answer=answers.append, **(given | {"check_seeds": 0}))
-    assert unchecked.parameters == quick.parameters and [a.notices for a in answers] == [unchecked.notices]
+    unchecked = jm.fit(
+        jm.Isometric(), simple_target(), answer=answers.append, **(given | {"check_seeds": 0})
+    )
+    assert unchecked.parameters == quick.parameters and [a.notices for a in answers] == [
+        unchecked.notices
+    ]
 
 
 @pytest.mark.slow
@@ -802,7 +979,9 @@ def test_an_interruption_between_the_search_and_the_answer_keeps_what_the_search
         patched.setattr(_search.Endpoint, "of", interrupt)
         jm.fit(jm.Isometric(), simple_target(), free=FEW, **QUICK)
     (task,) = caught.value.tasks
-    assert {name: task[name] for name in FEW} == {name: caught.value.result.task[name] for name in FEW}
+    assert {name: task[name] for name in FEW} == {
+        name: caught.value.result.task[name] for name in FEW
+    }
     assert caught.value.result.success and "seeds" not in caught.value.result.check
 
 
@@ -842,22 +1021,31 @@ def test_what_a_fit_says_about_itself():
 
 @pytest.mark.slow
 def test_monte_carlo_agrees_with_the_linear_fit():
-    """The control variate leaves a dozen paths the error of thousands, so both minima are the same."""
+    """The control variate leaves a dozen paths the error of thousands, so both minima are the
+    same."""
     with without_intervals():
         linear = jm.fit(jm.Isometric(), simple_target(), **SIMULATED)
         simulated = jm.fit(jm.Isometric(), simple_target(), method="montecarlo", **SIMULATED)
-    known = [name for name, estimate in (linear.parameters | linear.derived).items() if estimate.stderr]
+    known = [
+        name for name, estimate in (linear.parameters | linear.derived).items() if estimate.stderr
+    ]
     assert len(known) > 3
     for name in known:
-        # Both stop within a thousandth of the cost, some 0.1 standard errors, and correct with different seeds.
+        # Both stop within a thousandth of the cost, some 0.1 standard errors, and correct with
+        # different seeds.
         assert abs(simulated[name].value - linear[name].value) < 0.2 * linear[name].stderr, name
 
 
 @pytest.mark.slow
 def test_weak_increments_change_a_fit_by_its_monte_carlo_error_only(x64):
-    """The nonlinear correction and the check are means over seeds; the path that is shown is not."""
+    """The nonlinear correction and the check are means over seeds; the path that is shown is
+    not."""
     gaussian, weak = quick_fit(), quick_fit(increments="weak")
-    known = [name for name, estimate in (gaussian.parameters | gaussian.derived).items() if estimate.stderr]
+    known = [
+        name
+        for name, estimate in (gaussian.parameters | gaussian.derived).items()
+        if estimate.stderr
+    ]
     assert len(known) > 3
     for name in known:
         assert abs(weak[name].value - gaussian[name].value) < 0.2 * gaussian[name].stderr, name
@@ -876,7 +1064,12 @@ def test_controlled_moments_are_those_of_a_controlled_ensemble(x64):
     problem = planned(jm.Isometric(), simple_target(), options).problem
     (part,), seeds = problem.montecarlo(16).parts, 16
     assert part.model.control
-    runs = runs_for_means(jm.settled(jm.Isometric()), jax.random.fold_in(problem.key, 0), seeds, Draws(increments="weak"))
+    runs = runs_for_means(
+        jm.settled(jm.Isometric()),
+        jax.random.fold_in(problem.key, 0),
+        seeds,
+        Draws(increments="weak"),
+    )
     power = at_once(lambda task: part.model.moments(task).power, as_arrays(jm.Isometric()))
     np.testing.assert_allclose(power, runs.mean_spectrum().power[:30], rtol=1e-9)
 
@@ -901,7 +1094,9 @@ def test_profile_and_bootstrap_find_a_line_that_is_there():
         truth = jm.expected_spectrum(task.replace(**changes))
         target = jm.Target("truth", np.asarray(truth.proportional), segments=12)
         with without_intervals():
-            found = jm.fit(jm.Isometric(), target, **RECOVERY | {"starts": 8, "seeds": 16, "check_seeds": 16})
+            found = jm.fit(
+                jm.Isometric(), target, **RECOVERY | {"starts": 8, "seeds": 16, "check_seeds": 16}
+            )
         assert found.harmonic_p_value is not None and low <= found.harmonic_p_value <= high
         assert found.profile is not None
         if not changes:
@@ -912,8 +1107,8 @@ def test_profile_and_bootstrap_find_a_line_that_is_there():
 
 @pytest.mark.slow
 def test_the_bootstrap_is_uniform_without_a_harmonic():
-    """p-values of spectra drawn from the model without harmonic: not all as small as those of a bootstrap that forgets how
-    many frequencies a harmonic may choose from.
+    """p-values of spectra drawn from the model without harmonic: not all as small as those of a
+    bootstrap that forgets how many frequencies a harmonic may choose from.
     """
     task = jm.Isometric().replace(harmonic_amplitude=0.0)
     expected = np.asarray(jm.expected_spectrum(task).power)
@@ -926,8 +1121,9 @@ def test_the_bootstrap_is_uniform_without_a_harmonic():
         with without_intervals():
             found = jm.fit(jm.Isometric(), target, free=free, starts=8, check_seeds=16, seeds=0)
         p.append(found.harmonic_p_value)
-    # All four below 0.1 have a probability of 1e-4. Bins are drawn independent here, while the bootstrap correlates
-    # neighbours by 0.45, which a line of two bins mimics: it may only make p larger.
+    # All four below 0.1 have a probability of 1e-4. Bins are drawn independent here, while the
+    # bootstrap correlates neighbours by 0.45, which a line of two bins mimics: it may only make p
+    # larger.
     assert max(p) > 0.1
 
 
@@ -940,8 +1136,11 @@ def ended(coordinates, frequencies, costs):
 
 def test_other_minima_in_frequency_are_polished_too(x64):
     problem = setup_of(jm.Isometric(), VASTUS, ("harmonic_frequency",))
-    found = ended(problem.coordinates, [3.9, 4.1, 6.6, 6.7, 8.0, 10.0], [5.0, 5.1, 6.0, 5.9, np.nan, 30.0])
-    assert contenders(problem, found, 6.0) == [0, 3]  # 4.1 and 6.6 Hz are nearer than a bin to a better one
+    found = ended(
+        problem.coordinates, [3.9, 4.1, 6.6, 6.7, 8.0, 10.0], [5.0, 5.1, 6.0, 5.9, np.nan, 30.0]
+    )
+    # 4.1 and 6.6 Hz are nearer than a bin to a better one
+    assert contenders(problem, found, 6.0) == [0, 3]
     assert contenders(problem, found, 0.5) == [0]
     other = setup_of(jm.Isometric(), VASTUS, ("c_w",))
     assert contenders(other, ended(other.coordinates, [400.0, 500.0], [2.0, 1.0]), 9.0) == [1]
@@ -955,27 +1154,39 @@ def test_a_frequency_that_the_spectrum_leaves_open_is_called_ambiguous(x64):
     objective = problem.montecarlo(1)
     assert rivals(problem, Stage("clear", objective, clear), {}) == ((), set())
     (said,), moved = rivals(problem, Stage("close", objective, close), {})
-    assert moved == {"harmonic_frequency"} and "harmonic_frequency is ambiguous: 6.60 Hz fits almost as well" in said
+    assert (
+        moved == {"harmonic_frequency"}
+        and "harmonic_frequency is ambiguous: 6.60 Hz fits almost as well" in said
+    )
 
 
 @pytest.mark.slow
 def test_two_equal_lines_make_the_frequency_ambiguous():
-    """A target with the same hump at 4.3 and 8.6 Hz: whichever one the harmonic takes, the other fits as well."""
+    """A target with the same hump at 4.3 and 8.6 Hz: whichever one the harmonic takes, the other
+    fits as well."""
     f = jm.SpectrumSettings().frequency
     power = 1 / (1 + (f / 1.2) ** 2) + 0.02
-    target = jm.Target("twins", power * (1 + 0.9 * (np.isin(np.arange(1, 31), (11, 22)))), segments=4)
+    target = jm.Target(
+        "twins", power * (1 + 0.9 * (np.isin(np.arange(1, 31), (11, 22)))), segments=4
+    )
     free = ("c_w", "noise_K_w", "harmonic_amplitude", "harmonic_frequency")
     found = jm.fit(jm.Isometric(), target, free=free, starts=6, seeds=16, check_seeds=16)
     assert any("harmonic_frequency is ambiguous" in notice for notice in found.notices)
     for table in (found.parameters, found.derived):
-        assert table["harmonic_frequency"].stderr is None and not table["harmonic_frequency"].identifiable
+        assert (
+            table["harmonic_frequency"].stderr is None
+            and not table["harmonic_frequency"].identifiable
+        )
 
 
 @pytest.mark.slow
 def test_mean_force_and_no_spread():
-    """Half a percent of the mean, which k_z alone can move; nothing is known about the scatter of the bins."""
+    """Half a percent of the mean, which k_z alone can move; nothing is known about the scatter of
+    the bins."""
     free = ("k_z", "noise_K_w")
-    result = jm.fit(jm.Isometric(), simple_target(segments=None), free=free, mean_force=(3.0, 0.015), **QUICK)
+    result = jm.fit(
+        jm.Isometric(), simple_target(segments=None), free=free, mean_force=(3.0, 0.015), **QUICK
+    )
     assert result.success
     assert abs(result.derived["mean"].value - 3.0) < 3 * 0.015
     assert result.chi2_per_bin is None and result.deviation is None
@@ -984,12 +1195,23 @@ def test_mean_force_and_no_spread():
 
 
 def test_a_start_that_is_left_behind_ends_sooner():
-    """Of four starts that gain evenly: the best; one near it; one far above and slow; one far above that comes nearer."""
+    """Of four starts that gain evenly: the best; one near it; one far above and slow; one far above
+    that comes nearer."""
     gains = np.array([0.02, 0.02, 0.02, 0.2])
 
     def active(margin, steps):
         none, cost = np.zeros(4, dtype=int), np.array([10.0, 11.5, 30.0, 30.0])
-        now = _Standing(*[np.zeros((4, 1))] * 2, cost, none, none, none, none, none, none, np.ones(4, dtype=bool))
+        now = _Standing(
+            *[np.zeros((4, 1))] * 2,
+            cost,
+            none,
+            none,
+            none,
+            none,
+            none,
+            none,
+            np.ones(4, dtype=bool),
+        )
         for _ in range(steps):
             now = now.advanced(now.s, now.ahead, now.cost - gains, now.accepted + 1, margin)
         return now.active.tolist()

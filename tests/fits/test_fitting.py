@@ -46,7 +46,9 @@ def test_a_fit_with_a_fresh_seed_is_within_the_expected_tolerance(scripts, name)
     found = scripts.values(result)
     assert set(found) == set(table["values"])
     off = {
-        key: (found[key], row) for key, row in table["values"].items() if abs(found[key] - row["value"]) > row["tolerance"]
+        key: (found[key], row)
+        for key, row in table["values"].items()
+        if abs(found[key] - row["value"]) > row["tolerance"]
     }
     assert not off, off
 
@@ -81,7 +83,12 @@ def paper_force():
 def test_the_preset_has_the_papers_amplitudes():
     task = jm.load_preset("zagrodny-slifkin")
     assert isinstance(task, jm.PrescribedMotion)
-    assert [task[f"noise_{c}"] for c in ("K_w", "K_z", "C_w", "C_z")] == [0.0016, 0.0016, 1e-4, 1e-4]
+    assert [task[f"noise_{c}"] for c in ("K_w", "K_z", "C_w", "C_z")] == [
+        0.0016,
+        0.0016,
+        1e-4,
+        1e-4,
+    ]
     assert task["harmonic_frequency"] == 4.25
 
 
@@ -98,7 +105,8 @@ def test_single_seeds_of_the_preset_show_both_maxima_more_often_than_not(paper_f
     both = (p.argmax(1) == 0) & (p[:, 10] > p[:, 9]) & (p[:, 10] > p[:, 11])
     with capsys.disabled():
         print(f"\nzagrodny-slifkin: {100 * both.mean():.0f} % of 200 single seeds show both maxima")
-    # Bins 1 and 2 hold about 0.21 and 0.16 of the power and scatter by 0.4 each: bin 1 wins in roughly 2 of 3.
+    # Bins 1 and 2 hold about 0.21 and 0.16 of the power and scatter by 0.4 each: bin 1 wins in
+    # roughly 2 of 3.
     assert 0.5 < both.mean() < 0.9
 
 
@@ -111,7 +119,8 @@ def test_the_presets_displacement_oscillates_about_the_cubics_root():
     runs = jm.ensemble(task, jax.random.key(3), seeds=40)
     moved = np.asarray(runs.between(), dtype=float)
     means = moved.mean(axis=1)
-    # Second-order shift of the mean: 3 k x var(x) / K_tangent, far below the seeds' standard error here.
+    # Second-order shift of the mean: 3 k x var(x) / K_tangent, far below the seeds' standard error
+    # here.
     assert abs(means.mean() - rest) < 3 * means.std(ddof=1) / np.sqrt(len(means)) + 1e-6 * rest
     crossings = (np.diff(np.sign(moved - rest), axis=1) != 0).sum(axis=1)
     assert crossings.min() >= 10  # in 10 s, thus about the equilibrium and not beside it

@@ -1,4 +1,5 @@
-"""95 % intervals against the profile of the cost on a grid; those of a half-power frequency about a shelf."""
+"""95 % intervals against the profile of the cost on a grid; those of a half-power frequency about a
+shelf."""
 
 import equinox as eqx
 import jax
@@ -23,18 +24,31 @@ from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
 
 NAME, FREE = "half_power_frequency", ("c_w", "c_z")
-# Without harmonic and floor. The passive damper makes a shelf at (2 C_z / (C_w + C_z))² of the power at 0.
+# Without harmonic and floor. The passive damper makes a shelf at (2 C_z / (C_w + C_z))² of the
+# power at 0.
 STILL = jm.Isometric().replace(harmonic_amplitude=0.0, noise_K_z=1e-4)
 STEEP, BENT, SHELF = (STILL.replace(c_z=c) for c in (5.0, 15.0, 20.0))
 LAST = 30.5 * STILL.settings.resolution  # upper edge of the bins
 
 
 def test_an_interval_that_says_next_to_nothing_is_none():
-    ends = {"known": Interval(-2.0, 2.0, True), "half": Interval(-1.0, None, True), "signed": Interval(-1.5, 400.0, False),
-            "vague": Interval(-4.0, 1.0, True), "open": Interval(None, None, True)}  # fmt: skip
+    ends = {
+        "known": Interval(-2.0, 2.0, True),
+        "half": Interval(-1.0, None, True),
+        "signed": Interval(-1.5, 400.0, False),
+        "vague": Interval(-4.0, 1.0, True),
+        "open": Interval(None, None, True),
+    }
     found = with_intervals({name: Estimate(1.0, "1", 0.1, True, True) for name in ends}, ends)
-    assert [name for name, p in found.items() if p.stderr is not None] == ["known", "half", "signed"]
-    assert all(found[name].identifiable is False and found[name].interval is None for name in ("vague", "open"))
+    assert [name for name, p in found.items() if p.stderr is not None] == [
+        "known",
+        "half",
+        "signed",
+    ]
+    assert all(
+        found[name].identifiable is False and found[name].interval is None
+        for name in ("vague", "open")
+    )
 
 
 def drawn(task, segments, seed):
@@ -71,7 +85,9 @@ PLANE = np.stack(np.meshgrid(AXIS, AXIS, indexing="ij"), axis=-1).reshape(-1, 2)
 def rise(objective, seen, theta):
     """Root of twice the rise of the cost above that of the fit."""
     rows = expand(objective, np.concatenate([seen.theta[None], theta]))
-    cost = np.sum(consequences_of_rows(objective, rows).residuals ** 2, axis=1) + np.sum(rows.theta**2, axis=1)
+    cost = np.sum(consequences_of_rows(objective, rows).residuals ** 2, axis=1) + np.sum(
+        rows.theta**2, axis=1
+    )
     return np.sqrt(np.maximum(cost[1:] - cost[0], 0.0))
 
 
@@ -117,8 +133,8 @@ def finer(values):
 def lowest(levels, rises):
     """The least rise over the line on which the level is zero, of values on the plane.
 
-    The line is taken where the level changes its sign between two points of a finer plane, linear in between; splines lead
-    from one plane to the other.
+    The line is taken where the level changes its sign between two points of a finer plane, linear
+    in between; splines lead from one plane to the other.
     """
     levels, rises = (finer(levels), np.sqrt(np.maximum(finer(rises**2), 0.0)))
     on_line = []
@@ -131,14 +147,22 @@ def lowest(levels, rises):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("task", "segments"), [(STEEP, 6), (BENT, 45), (SHELF, 45)], ids=["steep", "bent", "shelf"])
+@pytest.mark.parametrize(
+    ("task", "segments"), [(STEEP, 6), (BENT, 45), (SHELF, 45)], ids=["steep", "bent", "shelf"]
+)
 def test_an_interval_ends_where_the_profile_does(task, segments, x64):
-    """With the inverse curvature as covariance the root of the rise that is sought is 1.96, at either end."""
+    """With the inverse curvature as covariance the root of the rise that is sought is 1.96, at
+    either end."""
     names = ["corner_frequency", "high_frequency_floor", "coefficient_of_variation"]
     problem, objective, seen = fitted(task, drawn(task, segments, 3))
     value, theta = consequences(objective, seen).values[0], seen.theta + PLANE
-    over_plane, rises = consequences_of_rows(objective, expand(objective, theta)).values[0], rise(objective, seen, theta)
-    found = intervals(problem, objective, seen, inverse_curvature(objective, seen), dict.fromkeys(names, 1.0))
+    over_plane, rises = (
+        consequences_of_rows(objective, expand(objective, theta)).values[0],
+        rise(objective, seen, theta),
+    )
+    found = intervals(
+        problem, objective, seen, inverse_curvature(objective, seen), dict.fromkeys(names, 1.0)
+    )
     for name in names:
         ends = found[name].about(value[name])
         assert ends[0] < value[name] < ends[1]
@@ -157,7 +181,8 @@ def test_the_level_is_zero_at_the_half_power_frequency(x64):
 
 @pytest.mark.slow
 def test_the_frequency_jumps_where_the_level_does_not(x64):
-    """A third more of the passive damping: four times the frequency, and below it at most a third more power."""
+    """A third more of the passive damping: four times the frequency, and below it at most a third
+    more power."""
     low, high = map(frequency_of, (BENT, SHELF))
     assert high > 3.5 * low
     grid = np.geomspace(0.2, low, 50)
@@ -167,13 +192,16 @@ def test_the_frequency_jumps_where_the_level_does_not(x64):
 @pytest.mark.slow
 @pytest.mark.parametrize("task", [STEEP, BENT], ids=["steep", "bent"])
 def test_that_of_a_half_power_frequency_ends_where_its_profile_does(task, x64):
-    """With the inverse curvature as covariance the root of the rise that is sought is 1.96, at either end."""
+    """With the inverse curvature as covariance the root of the rise that is sought is 1.96, at
+    either end."""
     problem, objective, seen = fitted(task, drawn(task, 45, 3))
     value, gain = consequences(objective, seen).values[0][NAME], inverse_curvature(objective, seen)
     low, high = half_power_intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value)
     assert low < value < high
     rises = rise(objective, seen, seen.theta + PLANE)
-    np.testing.assert_allclose([lowest(level(task, seen.theta + PLANE, f), rises) for f in (low, high)], 1.96, rtol=0.03)
+    np.testing.assert_allclose(
+        [lowest(level(task, seen.theta + PLANE, f), rises) for f in (low, high)], 1.96, rtol=0.03
+    )
 
 
 @pytest.mark.slow
@@ -184,23 +212,34 @@ def test_about_a_shelf_there_is_no_interval(x64):
     assert value < 0.2 * LAST
     theta = seen.theta + PLANE
     rises = rise(objective, seen, theta)
-    assert max(lowest(level(SHELF, theta, f), rises) for f in np.geomspace(value, 2 * LAST, 8)[1:]) < 1.96
-    assert half_power_intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value) == (None, None)
+    assert (
+        max(lowest(level(SHELF, theta, f), rises) for f in np.geomspace(value, 2 * LAST, 8)[1:])
+        < 1.96
+    )
+    assert half_power_intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value) == (
+        None,
+        None,
+    )
 
 
 @pytest.mark.slow
 def test_stated_intervals_hold_the_truth(x64):
-    """Dampings drawn from the prior about a bent response: misses at most as 5 % allow once in 10 000 runs."""
+    """Dampings drawn from the prior about a bent response: misses at most as 5 % allow once in 10
+    000 runs."""
     rng, held = np.random.default_rng(8), []
     for seed in range(40):
         theta = rng.standard_normal(2)
-        truth = BENT.replace(c_w=float(BENT["c_w"]) * np.exp(theta[0]), c_z=float(BENT["c_z"]) * np.exp(theta[1]))
+        truth = BENT.replace(
+            c_w=float(BENT["c_w"]) * np.exp(theta[0]), c_z=float(BENT["c_z"]) * np.exp(theta[1])
+        )
         problem, objective, seen = fitted(BENT, drawn(truth, 12, seed), theta)
         found = consequences(objective, seen)
         scatter = residual_covariance(problem.parts[0].target, objective.parts[0], np.zeros(30))
         covariance = parameter_covariance(found.jacobian, scatter, problem.prior)
         value = float(found.values[0][NAME])
-        low, high = half_power_intervals(problem, objective, seen, covariance, {NAME: 1.0})[NAME].about(value)
+        low, high = half_power_intervals(problem, objective, seen, covariance, {NAME: 1.0})[
+            NAME
+        ].about(value)
         if low is not None:
             held.append(low <= frequency_of(truth) <= high)
     assert len(held) >= 15 and len(held) - sum(held) <= scipy.stats.binom.isf(1e-4, len(held), 0.05)

@@ -43,24 +43,36 @@ def test_coordinates_and_parameters(problem):
     theta = problem.theta(values)
     back = problem.parameters(theta)
     assert {name: float(back[name]) for name in values} == pytest.approx(values, rel=1e-9)
-    assert float(problem.task(theta).k_w) == pytest.approx(4e5) and float(problem.task(theta).m_w) == TASK.m_w
+    assert (
+        float(problem.task(theta).k_w) == pytest.approx(4e5)
+        and float(problem.task(theta).m_w) == TASK.m_w
+    )
     with pytest.raises(ValueError, match="'m_w' is not free in this problem"):
         problem.theta({"m_w": 1.0})
     with pytest.raises(ValueError, match=r"harmonic_frequency = 99\.0 lies outside"):
         problem.theta({"harmonic_frequency": 99.0})
-    assert str(problem).startswith("problem of vastus-lateralis-26mvc") and "<table>" in problem._repr_html_()
+    assert (
+        str(problem).startswith("problem of vastus-lateralis-26mvc")
+        and "<table>" in problem._repr_html_()
+    )
 
 
 @pytest.mark.slow
 def test_values_are_traced_on_their_way_to_theta_and_exact_beside_a_bound():
-    """A log density of parameters in their units, as `problem.theta` under `jit` and `grad` makes it."""
+    """A log density of parameters in their units, as `problem.theta` under `jit` and `grad` makes
+    it."""
     problem = jm.problem(TASK, TARGET, free=("k_w", "x_z", "harmonic_frequency"), bounds=BOUNDS)
     start = {name: float(TASK[name]) for name in problem.names}
     back = kept_jit(lambda values: problem.parameters(problem.theta(values)))
-    for values in ({"k_w": 3e5, "x_z": -0.003, "harmonic_frequency": 3.0001}, {"harmonic_frequency": 8.9999}):
+    for values in (
+        {"k_w": 3e5, "x_z": -0.003, "harmonic_frequency": 3.0001},
+        {"harmonic_frequency": 8.9999},
+    ):
         given = start | values
         assert problem.parameters(problem.theta(given)) == pytest.approx(given, rel=1e-9)
-        assert {name: float(value) for name, value in back(given).items()} == pytest.approx(given, rel=1e-9)
+        assert {name: float(value) for name, value in back(given).items()} == pytest.approx(
+            given, rel=1e-9
+        )
     slopes = at_once(jax.jacrev(lambda values: problem.parameters(problem.theta(values))), start)
     for name in start:  # the way there and back is the identity
         of_each = {other: float(slope) for other, slope in slopes[name].items()}
@@ -71,7 +83,8 @@ def test_values_are_traced_on_their_way_to_theta_and_exact_beside_a_bound():
 
 @pytest.mark.slow
 def test_the_prior_is_a_density_of_the_coordinates(problem):
-    """`ln N(z) + ln |dz/dθ|` with z the distance from the prior's centre in its standard deviations, from the parameters."""
+    """`ln N(z) + ln |dz/dθ|` with z the distance from the prior's centre in its standard
+    deviations, from the parameters."""
     theta = problem.theta({"k_w": 3e5, "harmonic_frequency": 7.0, "noise_K_z": 0.02})
     sds = np.array([jm.PARAMETERS[name].prior_sd for name in problem.names])
 
@@ -91,35 +104,52 @@ def test_the_prior_is_a_density_of_the_coordinates(problem):
 
 @pytest.mark.slow
 def test_log_density_and_its_slope(problem):
-    """The likelihood is that of `log_likelihood` but for a constant; both halves are differentiable."""
+    """The likelihood is that of `log_likelihood` but for a constant; both halves are
+    differentiable."""
     theta = problem.theta({"c_w": 90.0, "harmonic_frequency": 7.0})
-    bare = jm.Target("spectrum alone", TARGET.proportional_power, segments=TARGET.segments)  # its law is the same everywhere
+    # its law is the same everywhere
+    bare = jm.Target("spectrum alone", TARGET.proportional_power, segments=TARGET.segments)
     alone = jm.problem(TASK, bare)
     ours = float(alone.log_likelihood(theta) - alone.log_likelihood(alone.start))
     theirs = float(jm.log_likelihood(alone.task(theta), bare) - jm.log_likelihood(TASK, bare))
     assert ours == pytest.approx(theirs, abs=1e-6)
-    steps = 1e-5 * np.concatenate([np.eye(len(theta)), -np.eye(len(theta)), np.zeros((1, len(theta)))])
-    around = np.asarray(at_once(lambda points: jax.lax.map(problem.log_density, points), theta + steps))
-    assert around[-1] == pytest.approx(float(problem.log_likelihood(theta) + problem.log_prior(theta)), abs=1e-9)
-    slope, (ahead, behind) = np.asarray(at_once(jax.grad(problem.log_density), theta)), np.split(around[:-1], 2)
+    steps = 1e-5 * np.concatenate(
+        [np.eye(len(theta)), -np.eye(len(theta)), np.zeros((1, len(theta)))]
+    )
+    around = np.asarray(
+        at_once(lambda points: jax.lax.map(problem.log_density, points), theta + steps)
+    )
+    assert around[-1] == pytest.approx(
+        float(problem.log_likelihood(theta) + problem.log_prior(theta)), abs=1e-9
+    )
+    slope, (ahead, behind) = (
+        np.asarray(at_once(jax.grad(problem.log_density), theta)),
+        np.split(around[:-1], 2),
+    )
     # Second-order differences of a smooth function.
     np.testing.assert_allclose(slope, (ahead - behind) / 2e-5, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
 def test_the_log_density_has_second_derivatives():
-    """Against differences of the slope, in a step so small that the ripple along the frequency does not show."""
+    """Against differences of the slope, in a step so small that the ripple along the frequency does
+    not show."""
     problem = jm.problem(TASK, TARGET, free=("c_w", "noise_K_w", "harmonic_frequency"))
     theta, step = problem.theta({"c_w": 90.0, "harmonic_frequency": 7.0}), 1e-6 * np.eye(3)
     points = theta + np.concatenate([np.zeros((3, 3)), step, -step])
 
-    def one(given):  # the slope, and its derivative in a direction, which is a column of the second derivatives
+    # the slope, and its derivative in a direction, which is a column of the second derivatives
+    def one(given):
         return jax.jvp(jax.grad(problem.log_density), given[:1], given[1:])
 
-    slope, column = map(np.asarray, at_once(lambda *given: jax.lax.map(one, given), points, np.tile(np.eye(3), (3, 1))))
+    slope, column = map(
+        np.asarray,
+        at_once(lambda *given: jax.lax.map(one, given), points, np.tile(np.eye(3), (3, 1))),
+    )
     (_, ahead, behind), found = np.split(slope, 3), column[:3]
     differences = (ahead - behind) / 2e-6
-    np.testing.assert_allclose(found, differences, rtol=1e-4)  # a slope of 300 is rounded by 1e-12, divided by the step
+    # a slope of 300 is rounded by 1e-12, divided by the step
+    np.testing.assert_allclose(found, differences, rtol=1e-4)
     np.testing.assert_allclose(found, found.T, rtol=1e-8)
 
 
@@ -132,7 +162,11 @@ def test_far_away_the_density_is_zero_and_not_a_number_for_a_sampler_to_choke_on
 
 def test_a_theta_of_another_shape_is_refused(problem):
     many = np.zeros((5, len(problem.names)))
-    for wrong, said in ((many, "use jax.vmap for several"), (np.zeros(2), "theta has the shape"), ({}, "problem.theta")):
+    for wrong, said in (
+        (many, "use jax.vmap for several"),
+        (np.zeros(2), "theta has the shape"),
+        ({}, "problem.theta"),
+    ):
         with pytest.raises(ValueError, match=said):
             problem._scaled(wrong)  # of all methods, which the tests' type checker guards by itself
     assert at_once(jax.vmap(problem.log_prior), many).shape == (5,)
@@ -140,7 +174,9 @@ def test_a_theta_of_another_shape_is_refused(problem):
 
 def test_bounds_are_counted_in_standard_deviations_of_the_prior():
     found = Coordinates.of(
-        {"k_w": 5e5, "x_z": 0.001}, {"k_w": (1e5, 2e6), "x_z": (-0.003, 0.002)}, {"k_w": 0.5, "x_z": 0.01}
+        {"k_w": 5e5, "x_z": 0.001},
+        {"k_w": (1e5, 2e6), "x_z": (-0.003, 0.002)},
+        {"k_w": 0.5, "x_z": 0.01},
     )
     np.testing.assert_allclose(found.low, [np.log(0.2) / 0.5, -0.4], rtol=1e-12)
     np.testing.assert_allclose(found.high, [np.log(4.0) / 0.5, 0.1], rtol=1e-12)
@@ -160,30 +196,44 @@ def test_the_log_likelihood_is_that_of_the_task_but_for_the_variation():
 
 @pytest.mark.slow
 def test_scipy_finds_the_minimum_of_the_fit(problem, result):
-    """In the two descents that a fit makes: what the harmonic holds of the bins is unknown first, then known.
+    """In the two descents that a fit makes: what the harmonic holds of the bins is unknown first,
+    then known.
 
-    A fit ends when two steps in a row gain less than 1e-4 of the cost; the table of starts is that of the first descent.
+    A fit ends when two steps in a row gain less than 1e-4 of the cost; the table of starts is that
+    of the first descent.
     """
     near = problem.theta({name: result[name].value for name in problem.names})
     for turn, used in enumerate((problem, problem.scattering_as(near))):
-        residuals, slopes = (kept_jit(each) for each in (used.residuals, jax.jacfwd(used.residuals)))
+        residuals, slopes = (
+            kept_jit(each) for each in (used.residuals, jax.jacfwd(used.residuals))
+        )
         begin = np.asarray(near) + 0.05 * (-1.0) ** np.arange(len(near))
         found = scipy.optimize.least_squares(residuals, begin, slopes, ftol=1e-12, xtol=1e-12)
-        ours = 0.5 * np.sum(np.asarray(residuals(near)) ** 2) if turn else min(start.cost for start in result.starts)
+        ours = (
+            0.5 * np.sum(np.asarray(residuals(near)) ** 2)
+            if turn
+            else min(start.cost for start in result.starts)
+        )
         assert found.success and found.cost == pytest.approx(ours, rel=1e-3)
 
 
 @pytest.mark.slow
 def test_another_optimiser_finds_the_same(result):
     other = jm.fit(TASK, TARGET, **ALONE, optimiser=optx.Dogleg(rtol=1e-9, atol=1e-9))
-    assert other.success and other.settings["optimiser"] == "Dogleg" and "optimiser" not in result.settings
+    assert (
+        other.success
+        and other.settings["optimiser"] == "Dogleg"
+        and "optimiser" not in result.settings
+    )
     best, mine = (min(start.cost for start in each.starts) for each in (other, result))
     assert best == pytest.approx(mine, rel=1e-3)
 
 
 def test_what_is_no_least_squares_solver_is_refused():
     for wrong in (optx.BFGS(1e-3, 1e-3), "dogleg", optx.LevenbergMarquardt):
-        with pytest.raises(ValueError, match=r"^optimiser: this is .*jaxmuscle\.problem\(task, target\)"):
+        with pytest.raises(
+            ValueError, match=r"^optimiser: this is .*jaxmuscle\.problem\(task, target\)"
+        ):
             jm.fit(TASK, TARGET, optimiser=wrong)
 
 
@@ -199,5 +249,6 @@ def test_results_summarise_themselves(result):
     summary = result.summary()
     assert str(summary) == repr(summary) == str(result) == repr(result)
     html = summary._repr_html_()
-    shown = (result.found | result.parameters).keys() - {"mean"}  # the other rows are per newton of it
+    # the other rows are per newton of it
+    shown = (result.found | result.parameters).keys() - {"mean"}
     assert html.count("<tr>") == 1 + len(shown) and ">determined<" in html

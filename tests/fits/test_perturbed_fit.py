@@ -1,4 +1,5 @@
-"""Fits of perturbed muscles, to data that a simulation written here makes: the numbers, their errors, and what follows."""
+"""Fits of perturbed muscles, to data that a simulation written here makes: the numbers, their
+errors, and what follows."""
 
 import dataclasses
 import re
@@ -26,19 +27,34 @@ from jaxmuscle.uncertainty._identifiability import fitted_problem
 TRUE = {"k_w": 4.6e5, "k_z": 7.8e5, "c_w": 114.0, "c_z": 1.8, "P_w": 5.0, "m_w": 0.5, "m_z": 0.5}
 NOISE = {"K_w": 0.27, "K_z": 0.002}
 X_REF, RATE, SECONDS = 0.02, 500, 64
-POINTS = 17  # of a published response; as many as in test_moved.py, so that the fits of both are one program
-WHOLE = {"K_w0": TRUE["k_w"] * X_REF**2, "K_z0": TRUE["k_z"] * X_REF**2, "C_w0": TRUE["c_w"], "C_z0": TRUE["c_z"]}
+# of a published response; as many as in test_moved.py, so that the fits of both are one program
+POINTS = 17
+WHOLE = {
+    "K_w0": TRUE["k_w"] * X_REF**2,
+    "K_z0": TRUE["k_z"] * X_REF**2,
+    "C_w0": TRUE["c_w"],
+    "C_z0": TRUE["c_z"],
+}
 
 
 def muscle_force(x, generator, noise=True, line=0.0):
-    """F_ext of the nonlinear muscle, x_z prescribed: Runge-Kutta steps of 2 ms, noise by scipy's Butterworth filter.
+    """F_ext of the nonlinear muscle, x_z prescribed: Runge-Kutta steps of 2 ms, noise by scipy's
+    Butterworth filter.
 
     `line`, of which amplitude, relative to K_z0, a sine of 4.25 Hz is added to K_z.
     """
     count, step = len(x), 1 / RATE
     shaping = scipy.signal.butter(2, 50 / (RATE / 2))
-    kicks = generator.normal(size=(2, count + 1000)) * np.array([[NOISE["K_w"]], [NOISE["K_z"]]]) * np.sqrt(RATE / 100)
-    dk = scipy.signal.lfilter(*shaping, kicks)[:, 1000:] * noise * np.array([[WHOLE["K_w0"]], [WHOLE["K_z0"]]])
+    kicks = (
+        generator.normal(size=(2, count + 1000))
+        * np.array([[NOISE["K_w"]], [NOISE["K_z"]]])
+        * np.sqrt(RATE / 100)
+    )
+    dk = (
+        scipy.signal.lfilter(*shaping, kicks)[:, 1000:]
+        * noise
+        * np.array([[WHOLE["K_w0"]], [WHOLE["K_z0"]]])
+    )
     dk[1] += line * WHOLE["K_z0"] * np.sin(2 * np.pi * 4.25 * np.arange(count) * step)
     half = np.arange(2 * count - 1) * step / 2
     motion = make_interp_spline(np.arange(count) * step, x, k=5)
@@ -47,7 +63,9 @@ def muscle_force(x, generator, noise=True, line=0.0):
     k_w, k_z, c_w, c_z, pull = (TRUE[n] for n in ("k_w", "k_z", "c_w", "c_z", "P_w"))
 
     def passive(i, w, u):
-        return c_z * (1 + v[i] ** 2) * (v[i] - u) + (k_z * (X_REF**2 + x[i] ** 2) + dz[i]) * (x[i] - w)
+        return c_z * (1 + v[i] ** 2) * (v[i] - u) + (k_z * (X_REF**2 + x[i] ** 2) + dz[i]) * (
+            x[i] - w
+        )
 
     def slope(i, w, u):
         active = c_w * (1 + u**2) * u + (k_w * (X_REF**2 + w**2) + dw[i]) * w
@@ -63,7 +81,10 @@ def muscle_force(x, generator, noise=True, line=0.0):
             b2, a2 = slope(i + 1, w + step / 2 * a1, u + step / 2 * b1), u + step / 2 * b1
             b3, a3 = slope(i + 1, w + step / 2 * a2, u + step / 2 * b2), u + step / 2 * b2
             b4, a4 = slope(i + 2, w + step * a3, u + step * b3), u + step * b3
-            w, u = w + step / 6 * (a1 + 2 * a2 + 2 * a3 + a4), u + step / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
+            w, u = (
+                w + step / 6 * (a1 + 2 * a2 + 2 * a3 + a4),
+                u + step / 6 * (b1 + 2 * b2 + 2 * b3 + b4),
+            )
     return force
 
 
@@ -99,23 +120,32 @@ def test_stiffness_and_damping_are_known(result):
         low, high = found.interval
         assert low < found.value < high
     assert abs(result["m_z"].value - TRUE["m_z"]) < 3 * result["m_z"].stderr
-    active = result["m_w"]  # no record tells it: it is free, so that its doubt is in the errors of the others
+    # no record tells it: it is free, so that its doubt is in the errors of the others
+    active = result["m_w"]
     assert active.free and active.stderr is None and 0.2 < active.value / TRUE["m_w"] < 5
     assert result.settings["prior_centre"]["m_w"] == TRUE["m_w"]  # not carried with the mean force
 
 
 @pytest.mark.slow
 def test_tangents_do_not_hang_on_the_reference_displacement(minute, result, x64):
-    """With 30 mm instead of 20 the same data give another K_w0, foretold in the text, and the same slopes at the hold."""
+    """With 30 mm instead of 20 the same data give another K_w0, foretold in the text, and the same
+    slopes at the hold."""
     task = result.task
     x_w = float(jm.response.equilibrium(task)[0])
     active = jax.grad(lambda x: task.muscle.active_force(x, 0.0, jax.numpy.zeros(5)))(x_w)
     assert result["K_w_tangent"].value == pytest.approx(float(active), rel=1e-2)
     still = np.asarray(jm.response.dynamic_stiffness(task, np.array([1e-5]))).real[0]
     assert result["tangent_stiffness"].value == pytest.approx(still, rel=1e-2)
-    true_w = brentq(lambda w: (WHOLE["K_w0"] / X_REF**2 * (X_REF**2 + w**2) + WHOLE["K_z0"]) * w - TRUE["P_w"], 0.0, 0.1)
+    true_w = brentq(
+        lambda w: (WHOLE["K_w0"] / X_REF**2 * (X_REF**2 + w**2) + WHOLE["K_z0"]) * w - TRUE["P_w"],
+        0.0,
+        0.1,
+    )
     true = WHOLE["K_w0"] * (1 + 3 * (true_w / X_REF) ** 2)
-    for name, value in (("K_w_tangent", true), ("tangent_stiffness", 1 / (1 / true + 1 / WHOLE["K_z0"]))):
+    for name, value in (
+        ("K_w_tangent", true),
+        ("tangent_stiffness", 1 / (1 / true + 1 / WHOLE["K_z0"])),
+    ):
         assert abs(result[name].value - value) < 3 * result[name].stderr, name
     longer = {"x_ref_w": 0.03, "x_ref_z": 0.03, "k_w": 5e5 / 2.25, "k_z": 5e5 / 2.25}
     with without_intervals():
@@ -154,19 +184,33 @@ def test_further_questions_take_it(result):
     np.testing.assert_allclose((profile.low, profile.high), (low, high), rtol=0.02)
     checked = jm.goodness(result, replicates=99)
     assert checked.p_value > 0.01  # the least that 99 replicates can give, if none is as far off
-    assert set(checked.observed) == {"chi2_per_bin", "runs", "largest", "chi2_per_point", "largest_point"}
+    assert set(checked.observed) == {
+        "chi2_per_bin",
+        "runs",
+        "largest",
+        "chi2_per_point",
+        "largest_point",
+    }
     assert checked.observed["chi2_per_point"] == pytest.approx(result.only.chi2_per_point)
     words = " ".join(str(checked).split())
-    assert "99 spectra and dynamic stiffnesses that were drawn from the fit" in words and "all five together" in words
+    assert (
+        "99 spectra and dynamic stiffnesses that were drawn from the fit" in words
+        and "all five together" in words
+    )
     figure = checked.plot()
-    assert sum(ax.get_ylabel() == "|Residual| (SE)" for ax in figure.axes) == 1 and len(figure.axes) == 7
+    assert (
+        sum(ax.get_ylabel() == "|Residual| (SE)" for ax in figure.axes) == 1
+        and len(figure.axes) == 7
+    )
     plt.close(figure)
 
 
 @pytest.mark.slow
 def test_the_posterior_is_as_wide_as_stated(result, monkeypatch):
-    """Its density falls by a half within one standard deviation, in every direction. Normal draws of this width, in the
-    place of chains (which tests/uncertainty/test_posterior.py has), give numbers that scatter as the fit states."""
+    """Its density falls by a half within one standard deviation, in every direction. Normal draws
+    of this width, in the place of chains (which tests/uncertainty/test_posterior.py has), give
+    numbers that scatter as the fit states.
+    """
     falls = []
 
     def drawn(density, _key, chains, draws, _warmup, _tell):
@@ -177,7 +221,12 @@ def test_the_posterior_is_as_wide_as_stated(result, monkeypatch):
         white = np.random.default_rng(3).standard_normal((chains, *draws, density.size))
         shape = white.shape[:2]
         made = np.ones(shape), np.ones(shape, dtype=int), np.zeros(shape, dtype=bool), 0.5
-        yield Chains(density.centre + white @ density.scale.T, -0.5 * np.sum(white**2, axis=-1), *made), density
+        yield (
+            Chains(
+                density.centre + white @ density.scale.T, -0.5 * np.sum(white**2, axis=-1), *made
+            ),
+            density,
+        )
 
     monkeypatch.setattr(_posterior, "sample", drawn)
     found = jm.posterior(result, key=3, chains=2, draws=120)
@@ -190,21 +239,29 @@ def test_the_posterior_is_as_wide_as_stated(result, monkeypatch):
 
 @pytest.mark.slow
 def test_a_bad_spectrum_does_not_hide_behind_a_good_response(result, x64):
-    """The residuals of the fit, those of the spectrum made larger and those of the response smaller."""
+    """The residuals of the fit, those of the spectrum made larger and those of the response
+    smaller."""
     assert not any("taken alone" in notice for notice in result.notices)
     problem, theta = fitted_problem(result, None)
     objective = problem.linear()
     ended = Endpoint(problem, objective, expand(objective, theta[None]).row(0))
-    bins, points = len(result.target.bins) - (problem.residual == "cumulative"), len(result.target.stiffness.known.frequency)
+    bins, points = (
+        len(result.target.bins) - (problem.residual == "cumulative"),
+        len(result.target.stiffness.known.frequency),
+    )
     changed = np.array(ended.found.residuals)
     changed[:bins] *= 9.0 / np.linalg.norm(changed[:bins])
     changed[-2 * points :] *= 0.7
     ended.__dict__["found"] = ended.found._replace(residuals=changed)
     verdict, (said,) = ended.judged
     assert verdict.adequate and verdict.chi2 == pytest.approx(np.sum(changed**2))
-    # 30 logs about their mean, less some of the six numbers of muscle and noise; and 81 is beyond all of these.
+    # 30 logs about their mean, less some of the six numbers of muscle and noise; and 81 is beyond
+    # all of these.
     said, _, todo = said.partition(". ")
-    missed = r"the model does not describe the spectrum, taken alone: chi2 81, expected ([\d.]+), p <= 0\.001"
+    missed = (
+        r"the model does not describe the spectrum, taken alone: chi2 81, expected ([\d.]+), p <="
+        r" 0\.001"
+    )
     found = re.fullmatch(missed, said)
     assert todo.endswith("look at the residuals of the spectrum in the figure")
     assert found and bins - 7 < float(found[1]) < bins
@@ -213,7 +270,9 @@ def test_a_bad_spectrum_does_not_hide_behind_a_good_response(result, x64):
     refused = Endpoint(problem, objective, expand(objective, theta[None]).row(0))
     refused.__dict__["found"] = ended.found._replace(residuals=changed)
     verdict, (said,) = refused.judged
-    assert not verdict.adequate and re.match(r"taken alone, the model describes the dynamic stiffness \(p = [01.]", said)
+    assert not verdict.adequate and re.match(
+        r"taken alone, the model describes the dynamic stiffness \(p = [01.]", said
+    )
     changed[-2 * points :] *= 10.0
     neither = Endpoint(problem, objective, expand(objective, theta[None]).row(0))
     neither.__dict__["found"] = ended.found._replace(residuals=changed)
@@ -222,7 +281,8 @@ def test_a_bad_spectrum_does_not_hide_behind_a_good_response(result, x64):
 
 @pytest.mark.slow
 def test_the_fitted_muscle_sees_what_it_was_fitted_to(minute, result):
-    """The response that was taken off is that of the muscle found: seen with it the numbers are the same."""
+    """The response that was taken off is that of the muscle found: seen with it the numbers are the
+    same."""
     with jax.enable_x64(True):
         again = seen_with(result.task, (minute,))
     off = (again.stiffness.value - result.target.stiffness.value) / result.target.stiffness.stderr
@@ -231,7 +291,8 @@ def test_the_fitted_muscle_sees_what_it_was_fitted_to(minute, result):
 
 @pytest.mark.slow
 def test_the_estimate_of_the_stiffness_is_not_biased(minute):
-    """Seen with the true muscle, whatever window, the points scatter about the truth by what they state."""
+    """Seen with the true muscle, whatever window, the points scatter about the truth by what they
+    state."""
     task = jm.PrescribedLength(harmonic=jm.Harmonic(amplitude=0.0)).replace(**TRUE)
     with jax.enable_x64(True):
         target = seen_with(task, (minute,))
@@ -239,56 +300,87 @@ def test_the_estimate_of_the_stiffness_is_not_biased(minute):
     z = (target.stiffness.value - true) / target.stiffness.stderr
     chi2, count = np.sum(np.abs(z) ** 2), 2 * len(z)
     low, high = scipy.stats.chi2.ppf([5e-5, 1 - 5e-5], count)
-    assert low < chi2 < 1.15 * high  # the density of the noise, from 24 ordinates at least, is known to a tenth or so
+    # the density of the noise, from 24 ordinates at least, is known to a tenth or so
+    assert low < chi2 < 1.15 * high
     assert target.stiffness.frequency[0] < 0.1 and target.mean_force is not None
     # The displacement makes most of the force: without it the fluctuations are left.
-    assert np.std(minute.force.samples) > 1.5 * target.coefficient_of_variation[0] * target.mean_force[0]
+    assert (
+        np.std(minute.force.samples)
+        > 1.5 * target.coefficient_of_variation[0] * target.mean_force[0]
+    )
 
 
 def test_a_window_needs_what_lies_before_it(minute):
     short = jm.PerturbedRecording.from_array(
-        minute.force.whole[: 9 * RATE], minute.displacement.whole[: 9 * RATE], RATE, positive="lengthening"
+        minute.force.whole[: 9 * RATE],
+        minute.displacement.whole[: 9 * RATE],
+        RATE,
+        positive="lengthening",
     )
-    with pytest.raises(ValueError, match=r"window.*less than 8 s besides 2 s before and after.*record longer"):
+    with pytest.raises(
+        ValueError, match=r"window.*less than 8 s besides 2 s before and after.*record longer"
+    ):
         short.target()
 
 
 def test_a_window_that_is_cut_says_so(minute):
     whole = minute.force.whole.size / RATE
     cut = jm.PerturbedRecording.from_array(
-        minute.force.whole, minute.displacement.whole, RATE, positive="lengthening", window=(20.0, whole)
+        minute.force.whole,
+        minute.displacement.whole,
+        RATE,
+        positive="lengthening",
+        window=(20.0, whole),
     ).target()
-    asked = f"of the window from 20 to {whole:.4g} s the fit uses 20 to {whole - 2:.4g} s: it needs 2 s"
+    asked = (
+        f"of the window from 20 to {whole:.4g} s the fit uses 20 to {whole - 2:.4g} s: it needs 2 s"
+    )
     assert any(notice.startswith(asked) for notice in cut.notices)
     inside = jm.PerturbedRecording.from_array(
-        minute.force.whole, minute.displacement.whole, RATE, positive="lengthening", window=(20.0, whole - 2.5)
+        minute.force.whole,
+        minute.displacement.whole,
+        RATE,
+        positive="lengthening",
+        window=(20.0, whole - 2.5),
     ).target()
     assert not any("the fit uses" in notice for notice in inside.notices)
 
 
 def test_a_task_that_cannot_be_moved(minute):
     target = minute.target()
-    with pytest.raises(ValueError, match=r"dynamic stiffness, which PrescribedForce cannot give.*PrescribedLength"):
+    with pytest.raises(
+        ValueError, match=r"dynamic stiffness, which PrescribedForce cannot give.*PrescribedLength"
+    ):
         jm.fit(jm.PrescribedForce(), target)
     assert isinstance(jm.task_for(target), jm.PrescribedLength)
 
 
 def test_a_displacement_that_moved_nothing(minute, tmp_path):
-    """The right force beside a motion of another time: neither a fit nor one trial of several takes it."""
+    """The right force beside a motion of another time: neither a fit nor one trial of several takes
+    it."""
     force, moved = minute.force.whole, np.roll(minute.displacement.whole, 20 * RATE)
     wrong = jm.PerturbedRecording.from_array(force, moved, RATE, source="other.csv")
     assert any("sign of the displacement is not found" in notice for notice in wrong.notices)
-    with pytest.raises(ValueError, match=r"does not follow the displacement at any frequency.*Check that the displacement"):
+    with pytest.raises(
+        ValueError,
+        match=r"does not follow the displacement at any frequency.*Check that the displacement",
+    ):
         jm.fit(jm.PrescribedLength(), wrong)
     with pytest.raises(ValueError, match=r"does not follow"):
         jm.fit(jm.PrescribedLength(), wrong.frequency_response())
     for number, trials in ((2, [minute, wrong]), (1, [wrong, minute])):
-        with pytest.raises(ValueError, match=rf"trial {number} of 2 \(other\.csv\): the force does not follow"):
+        with pytest.raises(
+            ValueError, match=rf"trial {number} of 2 \(other\.csv\): the force does not follow"
+        ):
             jm.fit(jm.PrescribedLength(), trials)
     time = np.arange(force.size) / RATE
     path = tmp_path / "wrong.csv"
     np.savetxt(
-        path, np.stack([time, force, 1e3 * moved], 1), delimiter=",", header="time_s,force_N,displacement_mm", comments=""
+        path,
+        np.stack([time, force, 1e3 * moved], 1),
+        delimiter=",",
+        header="time_s,force_N,displacement_mm",
+        comments="",
     )
     with pytest.raises(ValueError, match=r"does not follow"):
         jm.fit(jm.PrescribedLength(), path)
@@ -314,28 +406,40 @@ def published():
     sd = np.abs(true) * np.sqrt((1 - coherence) / (2 * averages * coherence))
     seen = true + sd * (generator.normal(size=POINTS) + 1j * generator.normal(size=POINTS))
     phase = np.degrees(np.angle(seen))
-    return jm.FrequencyResponse.from_gain(f, np.abs(seen), phase, coherence=coherence, segments=averages, name="published")
+    return jm.FrequencyResponse.from_gain(
+        f, np.abs(seen), phase, coherence=coherence, segments=averages, name="published"
+    )
 
 
 @pytest.mark.slow
 def test_a_published_response_alone(published):
     result = jm.fit(jm.PrescribedLength().replace(P_w=5.0), published)
     assert result.success and result.adequate and result.chi2_per_bin is None
-    assert result.target.bins.size == 0 and "mean" not in result.derived and "harmonic_frequency" not in result.free
+    assert (
+        result.target.bins.size == 0
+        and "mean" not in result.derived
+        and "harmonic_frequency" not in result.free
+    )
     for name, true in WHOLE.items():
-        assert result[name].stderr is None or abs(result[name].value - true) < 4 * result[name].stderr
+        assert (
+            result[name].stderr is None or abs(result[name].value - true) < 4 * result[name].stderr
+        )
     assert result["K_z0"].stderr < 0.05 * WHOLE["K_z0"]
 
 
 @pytest.mark.slow
 def test_a_published_response_with_a_spectrum_of_the_same_muscle(published):
-    still = jm.Isometric(harmonic=jm.Harmonic(amplitude=0.0)).replace(**TRUE, noise_K_w=NOISE["K_w"], noise_K_z=NOISE["K_z"])
+    still = jm.Isometric(harmonic=jm.Harmonic(amplitude=0.0)).replace(
+        **TRUE, noise_K_w=NOISE["K_w"], noise_K_z=NOISE["K_z"]
+    )
     power = np.asarray(jm.expected_spectrum(still).power)
     spectrum = jm.Target("held", power, segments=40, settings=still.settings)
     moved = still.as_task(jm.PrescribedLength, P_w=still.P_w)
     tasks = {"moved": moved, "held": still}
     with without_intervals():
-        result = jm.fit_joint({"moved": published, "held": spectrum}, tasks=tasks, starts=8, seeds=0)
+        result = jm.fit_joint(
+            {"moved": published, "held": spectrum}, tasks=tasks, starts=8, seeds=0
+        )
         alone = jm.fit(moved, published, starts=8, check_seeds=0)
     assert result.success and result.adequate
     for name in ("K_w0", "K_z0", "C_w0"):
@@ -367,36 +471,60 @@ def test_likelihood_of_a_stiffness(published):
 def test_points_of_no_use_are_left_out(published):
     stderr = np.array(published.stderr)
     stderr[3] = np.inf
-    open_point = dataclasses.replace(published, stderr=stderr) if dataclasses.is_dataclass(published) else published
+    open_point = (
+        dataclasses.replace(published, stderr=stderr)
+        if dataclasses.is_dataclass(published)
+        else published
+    )
     assert len(open_point.known.frequency) == len(published.frequency) - 1
 
 
 @pytest.mark.slow
 def test_two_minutes_know_more(minute, result):
-    """Of a muscle whose active mass is known: with a free one its doubt, which no record lessens, is in the errors."""
+    """Of a muscle whose active mass is known: with a free one its doubt, which no record lessens,
+    is in the errors."""
     given = {"fix": {"m_w": TRUE["m_w"]}, "starts": 8, "check_seeds": 0}
     with without_intervals():
-        one, both = (jm.fit(jm.PrescribedLength(), trials, **given) for trials in (minute, [minute, recorded(6)]))
+        one, both = (
+            jm.fit(jm.PrescribedLength(), trials, **given)
+            for trials in (minute, [minute, recorded(6)])
+        )
     assert both.success and both.adequate
     for name, true in WHOLE.items():
         assert abs(both[name].value - true) < 3.9 * both[name].stderr
         assert 0.5 < both[name].stderr / one[name].stderr < 0.95  # 1 / √2 is expected
         assert one[name].stderr < 1.1 * result[name].stderr, name
     assert one["K_z0"].stderr < 0.9 * result["K_z0"].stderr
-    assert both["m_w"].value == TRUE["m_w"] and "held fixed: m_w = 0.5 kg. The data do not determine it" in str(both)
+    assert both["m_w"].value == TRUE[
+        "m_w"
+    ] and "held fixed: m_w = 0.5 kg. The data do not determine it" in str(both)
 
 
 @pytest.mark.slow
 def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
-    """Strong, with activation, bent by 8 mm, moved in two bands. The response of a base model's muscle, which the search
-    begins with, leaves two thirds more variance: this test fails with it (`_search.RENEWALS` = 0)."""
-    true = {"k_w": 1.61e7, "k_z": 1.61e7, "c_w": 1360.0, "c_z": 168.0, "P_w": 141.0, "noise_K_w": 0.27, "noise_K_z": 0.0013,
-            "m_w": 0.5, "m_z": 0.5, "activation_time": 0.05}  # fmt: skip
+    """Strong, with activation, bent by 8 mm, moved in two bands. The response of a base model's
+    muscle, which the search begins with, leaves two thirds more variance: this test fails with it
+    (`_search.RENEWALS` = 0).
+    """
+    true = {
+        "k_w": 1.61e7,
+        "k_z": 1.61e7,
+        "c_w": 1360.0,
+        "c_z": 168.0,
+        "P_w": 141.0,
+        "noise_K_w": 0.27,
+        "noise_K_z": 0.0013,
+        "m_w": 0.5,
+        "m_z": 0.5,
+        "activation_time": 0.05,
+    }
     muscle = jm.on_rung(jm.PrescribedLength(harmonic=jm.Harmonic(amplitude=0.0)), 1).replace(**true)
     rate, time = 100, np.arange(90 * 100 + 1) / 100
     rng = np.random.default_rng(2)
     lines = np.concatenate([np.arange(28, 36), np.arange(170, 200)]) / 60
-    length = np.cos(2 * np.pi * np.outer(time, lines) + rng.uniform(0, 2 * np.pi, lines.size)).sum(axis=1)
+    length = np.cos(2 * np.pi * np.outer(time, lines) + rng.uniform(0, 2 * np.pi, lines.size)).sum(
+        axis=1
+    )
     length *= 1e-3 / np.std(length)
     moved = jm.settled(muscle).with_parts(x_z=jm.model.Sampled.through(time, -length))
     force = np.asarray(jm.simulate(moved, 11, duration=90.0, rate=float(rate)).output)
@@ -409,19 +537,30 @@ def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
     assert alike(fit.target, again)
     with jax.enable_x64(True):
         resting = float(jm.response.expected_variation(jm.settled(muscle)))
-    # Of 60 s a coefficient of variation has an error of 4 %; the base model's muscle left 70 % more.
+    # Of 60 s a coefficient of variation has an error of 4 %; the base model's muscle left 70 %
+    # more.
     assert abs(float(np.mean(fit.target.coefficient_of_variation)) / resting - 1) < 0.1
     for name in ("K_z0", "C_z0", "noise_K_w"):
-        value = true["k_z"] * X_REF**2 if name == "K_z0" else true["c_z"] if name == "C_z0" else true[name]
+        value = (
+            true["k_z"] * X_REF**2
+            if name == "K_z0"
+            else true["c_z"]
+            if name == "C_z0"
+            else true[name]
+        )
         assert abs(fit[name].value - value) < 4 * fit[name].stderr, name
 
 
 @pytest.mark.slow
 def test_a_line_in_the_fluctuations_is_fitted_though_noise_alone_passes():
-    """Left out, it would move C_w0 and K_z0 by about one stated error. (Without one none is fitted: `minute`.)"""
+    """Left out, it would move C_w0 and K_z0 by about one stated error. (Without one none is fitted:
+    `minute`.)"""
     with without_intervals():
-        # Without the tremor, which is tried where a line is significant: tests/fits/test_rungs.py has it.
-        result = jm.fit(jm.PrescribedLength(), recorded(5, line=0.003), rungs=1, starts=8, check_seeds=0)
+        # Without the tremor, which is tried where a line is significant: tests/fits/test_rungs.py
+        # has it.
+        result = jm.fit(
+            jm.PrescribedLength(), recorded(5, line=0.003), rungs=1, starts=8, check_seeds=0
+        )
     before, after = result.ladder[:2]
     assert (before.model, after.number) == ("noise alone", 0) and before.p >= 0.01
     assert after.aic < before.aic - 2 and result.adequate
@@ -433,14 +572,19 @@ def test_a_line_in_the_fluctuations_is_fitted_though_noise_alone_passes():
 def test_a_harmonic_that_is_asked_for_is_not_left_out():
     task = jm.PrescribedLength()
     assert float(without_rhythm(task, FitOptions()).harmonic.amplitude) == 0
-    for asked in ({"priors": {"harmonic_amplitude": 0.5}}, {"bounds": {"harmonic_frequency": (3.0, 6.0)}}):
+    for asked in (
+        {"priors": {"harmonic_amplitude": 0.5}},
+        {"bounds": {"harmonic_frequency": (3.0, 6.0)}},
+    ):
         assert without_rhythm(task, FitOptions(**asked)) is task
 
 
 @pytest.mark.slow
 def test_without_scatter_there_is_no_verdict(minute):
     seen = minute.target()
-    silent = jm.Target("silent", seen.proportional_power, bins=seen.bins, quantity="force", settings=seen.settings)
+    silent = jm.Target(
+        "silent", seen.proportional_power, bins=seen.bins, quantity="force", settings=seen.settings
+    )
     quick = {"starts": 8, "seeds": 0, "check_seeds": 0}
     result = jm.fit(jm.PrescribedLength(), silent.with_stiffness(seen.stiffness), **quick)
     assert result.success and result.adequate is None and "cannot be judged" in result.verdict
@@ -448,13 +592,18 @@ def test_without_scatter_there_is_no_verdict(minute):
 
 @pytest.mark.slow
 def test_a_hold_beside_it_is_of_the_same_masses(minute, result):
-    """Both tasks share the masses, which are not carried with the mean force; a hold more leaves no larger errors."""
+    """Both tasks share the masses, which are not carried with the mean force; a hold more leaves no
+    larger errors."""
     force = muscle_force(np.zeros(SECONDS * RATE), np.random.default_rng(8))
     hold = jm.Recording(force, RATE, unit="N", name="held").steady((2.0, 62.0)).target()
     with without_intervals():
         both = jm.fit_joint({"moved": minute, "held": hold}, starts=8, seeds=0)
     assert both.success and both.adequate
-    assert both["m_w"].free and both["m_z"].free and not any("m_w@" in name or "m_z@" in name for name in both.parameters)
+    assert (
+        both["m_w"].free
+        and both["m_z"].free
+        and not any("m_w@" in name or "m_z@" in name for name in both.parameters)
+    )
     assert both.settings["prior_centre"]["m_w"] == both.settings["prior_centre"]["m_z"] == 0.5
     assert both.settings["carried"] > 1.1
     assert both["K_w_tangent@moved"].stderr < 1.1 * result["K_w_tangent"].stderr

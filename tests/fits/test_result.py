@@ -1,4 +1,5 @@
-"""Fit results and presets: what is saved is read back equal, files are whole or not there, errors name the remedy."""
+"""Fit results and presets: what is saved is read back equal, files are whole or not there, errors
+name the remedy."""
 
 import dataclasses
 import json
@@ -24,7 +25,9 @@ from jaxmuscle.fits._result_text import _table, card_of
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 
 POWER = 1 / (1 + np.arange(1, 31) ** 2)
-TARGET = jm.Target("made", POWER, segments=[6, 7], coefficient_of_variation=0.02, notices=["a notice"])
+TARGET = jm.Target(
+    "made", POWER, segments=[6, 7], coefficient_of_variation=0.02, notices=["a notice"]
+)
 
 
 PART = [field.name for field in dataclasses.fields(jm.fits.FittedPart)]
@@ -34,14 +37,25 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
     """A result with a value in every field, as a fit would give; nothing is simulated."""
     task = jm.Isometric().replace(c_w=50.0 / 3, harmonic_phase=-0.1)
     parameters = {
-        name: Estimate(float(value), "N", 0.1 / 3 if name == "c_w" else None, name in ("c_w", "k_w"), name != "k_w")
+        name: Estimate(
+            float(value),
+            "N",
+            0.1 / 3 if name == "c_w" else None,
+            name in ("c_w", "k_w"),
+            name != "k_w",
+        )
         for name, value in task.parameters.items()
     }
     rng = np.random.default_rng(0)
     fields: dict[str, Any] = {
         "success": True,
         "message": "converged: 1 of 2 starts reach a fit as good as this (cost within 5 %)",
-        "adequacy": Adequacy(26.1, 25.0, 0.4, "the data have more power than the model at 4.3 Hz (1.2 standard errors)"),
+        "adequacy": Adequacy(
+            26.1,
+            25.0,
+            0.4,
+            "the data have more power than the model at 4.3 Hz (1.2 standard errors)",
+        ),
         "task": task,
         "target": TARGET,
         "method": "montecarlo",
@@ -62,12 +76,20 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "residual": rng.standard_normal(30),
         "deviation": rng.uniform(0.1, 0.3, 30),
         "components": {"relaxation": rng.uniform(0, 1, 30), "tremor": rng.uniform(0, 1, 30)},
-        "ladder": (Rung(0, "base", -250.1, 6.5, 1.9, 0.002), Rung(1, "with activation", -260.0, 7.1, 0.9, 0.3, True)),
+        "ladder": (
+            Rung(0, "base", -250.1, 6.5, 1.9, 0.002),
+            Rung(1, "with activation", -260.0, 7.1, 0.9, 0.3, True),
+        ),
         "starts": (Start(1.5, True, 12, (4e5, 50 / 3)), Start(None, False, 3)),
         "stretch": (np.arange(10.0, 15.0, 0.01), rng.standard_normal(500)),
         "profile": (np.linspace(0.4, 11.7, 64), rng.uniform(0, 9, 64)),
         "harmonic_p_value": 0.08,
-        "check": {"seeds": 64, "largest_deviation": 0.002, "largest_deviation_se": 2.1, "largest_deviation_sd": 0.01},
+        "check": {
+            "seeds": 64,
+            "largest_deviation": 0.002,
+            "largest_deviation_se": 2.1,
+            "largest_deviation_sd": 0.01,
+        },
         "further": {"coefficient_of_variation": -1.5},
         "stiffness": None,
         "notices": ("a notice",),
@@ -99,13 +121,30 @@ def failed_result():
     """What a fit gives whose every start explodes."""
     nothing = np.full(30, np.nan)
     return made_result(
-        success=False, message="no start has a finite spectrum", derived={"mean": Estimate(np.nan, "N")}, adequacy=None,
-        products=(), further={}, correlation={}, undetermined=(),
-        singular_values=np.full(2, np.nan), chi2_per_bin=None, rms_log_error=None,
-        fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None, components={}, ladder=(),
-        stretch=(np.zeros(0), np.zeros(0)), profile=None, harmonic_p_value=None, check={}, seed=None,
+        success=False,
+        message="no start has a finite spectrum",
+        derived={"mean": Estimate(np.nan, "N")},
+        adequacy=None,
+        products=(),
+        further={},
+        correlation={},
+        undetermined=(),
+        singular_values=np.full(2, np.nan),
+        chi2_per_bin=None,
+        rms_log_error=None,
+        fitted=nothing,
+        harmonic_share=nothing,
+        residual=nothing,
+        deviation=None,
+        components={},
+        ladder=(),
+        stretch=(np.zeros(0), np.zeros(0)),
+        profile=None,
+        harmonic_p_value=None,
+        check={},
+        seed=None,
         starts=(Start(None, False, 0),),
-    )  # fmt: skip
+    )
 
 
 def assert_equal(a, b):
@@ -135,9 +174,17 @@ def assert_equal(a, b):
 def test_every_number_by_its_name():
     result = made_result()
     corner = result["corner_frequency"]
-    assert (corner.value, corner.stderr, corner.unit, corner.interval) == (1 / 3, 0.01, "Hz", (0.31, None))
+    assert (corner.value, corner.stderr, corner.unit, corner.interval) == (
+        1 / 3,
+        0.01,
+        "Hz",
+        (0.31, None),
+    )
     assert result["c_w"].value == result.task["c_w"] and result["m_w"].stderr is None
-    with pytest.raises(ValueError, match="unknown quantity 'corner_frequenzy' of the fit of made: did you mean 'corner_f"):
+    with pytest.raises(
+        ValueError,
+        match="unknown quantity 'corner_frequenzy' of the fit of made: did you mean 'corner_f",
+    ):
         result["corner_frequenzy"]
 
 
@@ -152,9 +199,25 @@ def test_the_numbers_of_several_targets_by_name():
 def test_a_result_as_a_table():
     result = made_result()
     table = result.to_dataframe().set_index("quantity")
-    assert list(table.columns) == ["kind", "value", "stderr", "low", "high", "unit", "free", "determined"]
-    assert set(table.index) == set(result.parameters) | set(result.derived) and table.index.is_unique
-    assert list(table.loc["corner_frequency", ["kind", "value", "stderr", "low"]]) == ["derived", 1 / 3, 0.01, 0.31]
+    assert list(table.columns) == [
+        "kind",
+        "value",
+        "stderr",
+        "low",
+        "high",
+        "unit",
+        "free",
+        "determined",
+    ]
+    assert (
+        set(table.index) == set(result.parameters) | set(result.derived) and table.index.is_unique
+    )
+    assert list(table.loc["corner_frequency", ["kind", "value", "stderr", "low"]]) == [
+        "derived",
+        1 / 3,
+        0.01,
+        0.31,
+    ]
     assert np.isnan(table["high"]["corner_frequency"]) and np.isnan(table["stderr"]["k_w"])
     assert list(table.loc["k_w", ["kind", "free", "determined"]]) == ["parameter", True, False]
     assert set(table.index[table["determined"]]) == {"c_w", "corner_frequency"}
@@ -168,12 +231,24 @@ def test_a_result_as_a_table():
 def test_a_tremor_is_listed_once_by_the_name_that_people_use(free, whose):
     frequency = Estimate(9.0, "Hz", 0.2 if free else None, free, free or None)
     result = made_result(
-        parameters={f"resonance_frequency{whose}": frequency, "harmonic_frequency": frequency, "m_w": Estimate(1.0, "kg")},
-        derived={f"tremor_frequency{whose}": frequency, "harmonic_frequency": frequency, "mean": Estimate(2.5, "N")},
+        parameters={
+            f"resonance_frequency{whose}": frequency,
+            "harmonic_frequency": frequency,
+            "m_w": Estimate(1.0, "kg"),
+        },
+        derived={
+            f"tremor_frequency{whose}": frequency,
+            "harmonic_frequency": frequency,
+            "mean": Estimate(2.5, "N"),
+        },
     )
     kinds = result.to_dataframe().set_index("quantity")["kind"].to_dict()
-    assert kinds == {"harmonic_frequency": "parameter", "m_w": "parameter", f"tremor_frequency{whose}": "parameter",
-                     "mean": "derived"}  # fmt: skip
+    assert kinds == {
+        "harmonic_frequency": "parameter",
+        "m_w": "parameter",
+        f"tremor_frequency{whose}": "parameter",
+        "mean": "derived",
+    }
     names = [row[0] for row in card_of(result).rows]
     assert f"tremor_frequency{whose}" in names and f"resonance_frequency{whose}" not in names
     assert result[f"resonance_frequency{whose}"] == frequency  # by either name
@@ -199,16 +274,37 @@ def test_the_file_has_the_entries_of_the_design(tmp_path):
     path = tmp_path / "fit.json"
     made_result().save(path)
     table = json.loads(path.read_text())
-    assert table["task"] == "isometric" and table["target"] == "made" and table["provenance"] == "user"
-    for key in ("success", "message", "method", "chi2_per_bin", "rms_log_error", "seed", "settings", "versions"):
+    assert (
+        table["task"] == "isometric" and table["target"] == "made" and table["provenance"] == "user"
+    )
+    for key in (
+        "success",
+        "message",
+        "method",
+        "chi2_per_bin",
+        "rms_log_error",
+        "seed",
+        "settings",
+        "versions",
+    ):
         assert table[key] == getattr(made_result(), key)
-    c_w = {"value": 50 / 3, "unit": "N", "stderr": 0.1 / 3, "free": True, "identifiable": True, "interval": None}
+    c_w = {
+        "value": 50 / 3,
+        "unit": "N",
+        "stderr": 0.1 / 3,
+        "free": True,
+        "identifiable": True,
+        "interval": None,
+    }
     assert table["parameters"]["c_w"] == c_w
     assert table["derived"]["corner_frequency"]["interval"] == [0.31, None]
     assert table["derived"]["K_w0"]["identifiable"] is None  # fixed: neither
     assert table["adequate"] is True and table["adequacy_p"] == 0.4
     assert table["per_newton"] == {"K_w0": 80.0}
-    assert table["parameters"]["k_w"]["stderr"] is None and not table["parameters"]["k_w"]["identifiable"]
+    assert (
+        table["parameters"]["k_w"]["stderr"] is None
+        and not table["parameters"]["k_w"]["identifiable"]
+    )
     assert set(table["spectrum"]) >= {"frequency_hz", "target", "fitted"}
     assert table["starts"] == [
         {"cost": 1.5, "success": True, "steps": 12, "values": [4e5, 50 / 3]},
@@ -247,26 +343,44 @@ def test_text_shows_what_is_known_and_what_is_not():
         "though not each factor alone (jaxmuscle identifiability has values): k_w / c_w",
         "not determined: do not interpret these values (per newton of mean force): k_w",
         "the data leave open: - all stiffness and damping can be multiplied by one number",
-        "stiffness and damping are stated here per newton of mean force. In fit.json (Python: result['K_w0'], "
-        "to_dataframe()) they are those of a model muscle that pulls with 2.5 N: divide by 2.5 N",
+        (
+            "stiffness and damping are stated here per newton of mean force. In fit.json (Python:"
+            " result['K_w0'], to_dataframe()) they are those of a model muscle that pulls with 2.5"
+            " N: divide by 2.5 N"
+        ),
         "note: a notice",
     ):
         assert part in words
     assert words.index("determined by the data") < words.index("not determined: do not")
-    assert made_result()["c_w"].value / made_result()["mean"].value == pytest.approx(6.667, abs=5e-4)
+    assert made_result()["c_w"].value / made_result()["mean"].value == pytest.approx(
+        6.667, abs=5e-4
+    )
     assert str(failed_result()).startswith("Not fitted: no start has a finite spectrum")
 
 
 def test_the_methods_paragraph_says_what_a_reader_needs_to_repeat_the_fit():
-    source = "2 trials: a.csv, column F, 1000 Hz, window 5.8 s to 23.5 s; b.csv, column F, 1000 Hz, window 5 s to 23.6 s"
+    source = (
+        "2 trials: a.csv, column F, 1000 Hz, window 5.8 s to 23.5 s; b.csv, column F, 1000 Hz,"
+        " window 5 s to 23.6 s"
+    )
     settings = jm.SpectrumSettings(filter_direction="both", sampling="filtered")
     target = jm.Target("made", np.ones(30), segments=[12, 14], source=source, settings=settings)
     said = made_result(target=target).methods()
-    for words in ("2 recordings of force (26 Welch segments), sampled at 1000 Hz: a part of 17.7 to 18.6 s of each",
-                  "Butterworth, order 9, 30 Hz, forwards and backwards", "Hann window, 256 samples, 50 % overlap",
-                  "from 0.39 to 11.72 Hz", "describes the data: chi2 per bin 0.90 (expected 0.86), p = 0.4",
-                  "(standard deviations): k_w 5e+05 N/m^3 (1).", "with activation (chi2 per bin 0.90, p = 0.3, AIC -260.0)",
-                  "Held fixed were", "m_w = 0.5 kg", "Software: jaxmuscle 0.1, jax 0.8"):  # fmt: skip
+    for words in (
+        (
+            "2 recordings of force (26 Welch segments), sampled at 1000 Hz: a part of 17.7 to 18.6"
+            " s of each"
+        ),
+        "Butterworth, order 9, 30 Hz, forwards and backwards",
+        "Hann window, 256 samples, 50 % overlap",
+        "from 0.39 to 11.72 Hz",
+        "describes the data: chi2 per bin 0.90 (expected 0.86), p = 0.4",
+        "(standard deviations): k_w 5e+05 N/m^3 (1).",
+        "with activation (chi2 per bin 0.90, p = 0.3, AIC -260.0)",
+        "Held fixed were",
+        "m_w = 0.5 kg",
+        "Software: jaxmuscle 0.1, jax 0.8",
+    ):
         assert words in said, (words, said)
     assert "nan" not in said and "None" not in said
     assert "We analysed the force spectrum made" in made_result().methods()
@@ -280,18 +394,24 @@ def test_text_counts_trials_and_segments_and_tells_how_much_the_trials_differ():
     assert "  2 trials, 13 Welch segments" in printed(segments=[6, 7])
     alike = "  2 trials, 13 Welch segments, dispersion 1.12 ± 0.08 (1 if they are alike)"
     assert alike in printed(segments=[6, 7], dispersion=[1.12, 0.08])
-    assert not any("trials" in line for given in ({}, {"segments": [12]}) for line in printed(**given))
+    assert not any(
+        "trials" in line for given in ({}, {"segments": [12]}) for line in printed(**given)
+    )
 
 
 def test_the_text_and_the_report_say_what_a_richer_model_gains():
     said = "with activation the AIC falls by 9.9 (chi2 per bin 0.90 instead of 1.90)"
     found = made_result()
     assert f"  {said}" in str(found).splitlines() and said in found.summary().remarks
-    assert not any("AIC" in words for words in (str(made_result(ladder=())), *made_result(ladder=()).summary().remarks))
+    assert not any(
+        "AIC" in words
+        for words in (str(made_result(ladder=())), *made_result(ladder=()).summary().remarks)
+    )
 
 
 def test_numbers_that_are_read_in_two_ways_are_said_in_both():
-    """A variation also in percent; a share of the tremor with the frequency from which it counts."""
+    """A variation also in percent; a share of the tremor with the frequency from which it
+    counts."""
     derived = {
         "tremor_frequency": Estimate(9.28, "Hz", 0.11),
         "tremor_share": Estimate(0.0133, "1", 0.0033),
@@ -309,25 +429,37 @@ def test_numbers_that_are_read_in_two_ways_are_said_in_both():
 
 def test_a_long_interval_is_set_apart_from_its_unit():
     rows = {"k_z": Estimate(3.27e6, "N/m^3", 3.8e5, interval=(2.85e6, 4.16e6))}
-    assert _table("determined by the data", rows, "95 % interval")[1].endswith(" 2.85e+06 to 4.16e+06 N/m^3")
+    assert _table("determined by the data", rows, "95 % interval")[1].endswith(
+        " 2.85e+06 to 4.16e+06 N/m^3"
+    )
 
 
 def test_an_interval_that_is_wider_than_its_error_says_is_to_be_stated():
     wide = Estimate(0.94, "Hz", 0.12, interval=(0.3, 2.23))
     usual = Estimate(0.94, "Hz", 0.12, interval=(0.7, 1.2))
     half_open = Estimate(0.94, "Hz", 0.12, interval=(None, 2.23))
-    words = "half_power_frequency: the interval is much wider than two standard errors to both sides. State the interval"
+    words = (
+        "half_power_frequency: the interval is much wider than two standard errors to both sides."
+        " State the interval"
+    )
     for found in (wide, usual, half_open):
         text = " ".join(str(made_result(derived={"half_power_frequency": found})).split())
         assert (words in text) == (found is wide)
 
 
 def test_a_fit_that_misses_the_data_says_so_first():
-    missed = Adequacy(145.0, 25.0, 0.001, "the data have more power than the model from 7 to 9 Hz (12.0 standard errors)")
+    missed = Adequacy(
+        145.0,
+        25.0,
+        0.001,
+        "the data have more power than the model from 7 to 9 Hz (12.0 standard errors)",
+    )
     found = made_result(adequacy=missed, chi2_per_bin=5.0)
     first, *rest = str(found).splitlines()
     assert found.adequate is False and found.adequacy_p == 0.001
-    assert first.startswith("The model does not describe the data: chi2 per bin 5.00 (expected 0.86), p")
+    assert first.startswith(
+        "The model does not describe the data: chi2 per bin 5.00 (expected 0.86), p"
+    )
     words = " ".join(" ".join(rest).split())
     for part in (
         f"errors are widened by a factor of {np.sqrt(145 / 25):.2g}",
@@ -337,14 +469,18 @@ def test_a_fit_that_misses_the_data_says_so_first():
     ):
         assert part in words
     unknown = made_result(adequacy=None, chi2_per_bin=None)
-    assert unknown.adequate is None and "the data cannot be judged: the target" in " ".join(str(unknown).split())
+    assert unknown.adequate is None and "the data cannot be judged: the target" in " ".join(
+        str(unknown).split()
+    )
 
 
 def test_text_fits_a_terminal():
     """Also with long sentences: nothing is lost, and what goes on is further in."""
     text = str(made_result(notices=("word " * 40,), message="a long message " * 10))
     assert max(map(len, text.splitlines())) <= 80 and text.count("word") == 40
-    assert all(line.startswith("    word") for line in text.splitlines() if line.strip().startswith("word"))
+    assert all(
+        line.startswith("    word") for line in text.splitlines() if line.strip().startswith("word")
+    )
     for name in jm.list_targets():
         assert max(map(len, str(jm.load_target(name)).splitlines())) <= 80
 
@@ -404,7 +540,10 @@ def test_json_refuses_what_it_has_no_word_for(tmp_path):
         (b"\xff\xfe\x00", "fit.json: is not UTF-8 text"),
         ("[1, 2]", "fit.json: holds no table, but a list"),
         ("{}", f"is not a fit result of format 2 or 3 or {FORMAT}; write it with FitResult.save"),
-        (f'{{"format": {FORMAT}, "format": {FORMAT}}}', "is not valid JSON: the key 'format' is there twice"),
+        (
+            f'{{"format": {FORMAT}, "format": {FORMAT}}}',
+            "is not valid JSON: the key 'format' is there twice",
+        ),
         ('{"format": true}', "is not a fit result of format"),
         ('{"a": ' + "[" * 100_000, "fit.json: is nested too deeply"),
         ('{"format": 99}', "is not a fit result of format"),
@@ -419,7 +558,9 @@ def test_what_is_not_a_result(text, message, tmp_path):
         jm.load_result(path)
 
 
-@pytest.mark.parametrize("entry", ["success", "parameters", "starts", "versions", "task_table", "target_table"])
+@pytest.mark.parametrize(
+    "entry", ["success", "parameters", "starts", "versions", "task_table", "target_table"]
+)
 def test_a_missing_entry_is_named(entry, tmp_path):
     path = tmp_path / "fit.json"
     made_result().save(path)
@@ -447,8 +588,16 @@ CONTRADICTIONS = {
         456540.0,
         "parameters.k_w.value is 456540.0, but 500000.0 in the task_table",
     ),
-    "the task": ("task_table.muscle.stiffness_w.k", 456540.0, "parameters.k_w.value is 500000.0, but 456540.0 in the task"),
-    "its name": ("task", "prescribed-force", 'task is "prescribed-force", but the rest of the file means "isometric"'),
+    "the task": (
+        "task_table.muscle.stiffness_w.k",
+        456540.0,
+        "parameters.k_w.value is 500000.0, but 456540.0 in the task",
+    ),
+    "its name": (
+        "task",
+        "prescribed-force",
+        'task is "prescribed-force", but the rest of the file means "isometric"',
+    ),
     "the target": ("target", "other", 'target is "other", but the rest of the file means "made"'),
     "the verdict": ("adequate", False, "adequate is false, but the rest of the file means true"),
     "the spectrum": ("spectrum.fitted", [1.0], "spectrum.fitted has 1 numbers, the target 30 bins"),
@@ -457,9 +606,21 @@ CONTRADICTIONS = {
         True,
         "settings.free names c_w, k_w, but free among the parameters are c_w, k_w, m_w",
     ),
-    "the prior": ("settings.prior_centre", {"c_w": 60.0}, "settings.prior_centre names c_w, but free among"),
-    "the settings": ("settings.spectrum.overlap", 0.4, "settings.spectrum.made.overlap is 0.4, but"),
-    "a type": ("derived.K_w0.value", "200", "derived.K_w0.value must be a number or nothing, not a text"),
+    "the prior": (
+        "settings.prior_centre",
+        {"c_w": 60.0},
+        "settings.prior_centre names c_w, but free among",
+    ),
+    "the settings": (
+        "settings.spectrum.overlap",
+        0.4,
+        "settings.spectrum.made.overlap is 0.4, but",
+    ),
+    "a type": (
+        "derived.K_w0.value",
+        "200",
+        "derived.K_w0.value must be a number or nothing, not a text",
+    ),
     "a switch": (
         "starts",
         [{"cost": 1.5, "success": 1, "steps": 12}],
@@ -485,7 +646,9 @@ def test_a_result_of_the_format_before_is_read_without_loss(tmp_path):
     result.save(path)
     table = json.loads(path.read_text())
     table["format"] = 2
-    table["target_table"] = {key: value for key, value in table["target_table"].items() if value is not None}
+    table["target_table"] = {
+        key: value for key, value in table["target_table"].items() if value is not None
+    }
     del table["target_table"]["settings"]["tapers"], table["task_table"]["settings"]["tapers"]
     del table["task_table"]["activation"], table["task_table"]["initial"]
     path.write_text(json.dumps(table))
@@ -579,7 +742,9 @@ def test_arrays_of_jax_are_saved_as_numbers(tmp_path, x64):
 def test_a_preset_holds_description_and_fit(tmp_path):
     import tomllib
 
-    jm.save_preset(tmp_path / "a.toml", jm.Isometric(), description="what", fit={"target": "t", "seed": 1})
+    jm.save_preset(
+        tmp_path / "a.toml", jm.Isometric(), description="what", fit={"target": "t", "seed": 1}
+    )
     table = tomllib.loads((tmp_path / "a.toml").read_text())
     assert table["description"] == "what" and table["fit"] == {"target": "t", "seed": 1}
 
@@ -616,7 +781,9 @@ def test_what_could_not_be_read_again_is_not_saved(tmp_path):
     path = tmp_path / "a.toml"
     same_name = eqx.tree_at(lambda t: t.noise, jm.Isometric(), BandLimitedNoise())
     for task, name in ((same_name, "BandLimitedNoise"), (OwnTask(), "OwnTask")):
-        with pytest.raises(PresetError, match=f"{name} is not one of jaxmuscle's own classes.*keep the code"):
+        with pytest.raises(
+            PresetError, match=f"{name} is not one of jaxmuscle's own classes.*keep the code"
+        ):
             task_to_table(task)
     with pytest.raises(PresetError):
         jm.save_preset(path, same_name)
@@ -647,12 +814,27 @@ WRONG = {
     "list.json": ("[]", "list.json: holds no table, but a list"),
     "empty.toml": ("", "empty.toml: is empty"),
     "target.toml": ('name = "t"', r"has no \[task_table\]: is it a preset"),
-    "task.toml": (preset_text(task="isometrics"), "task.toml: task = 'isometrics': did you mean 'isometric'"),
-    "key.toml": (preset_text(muscles=1), "key.toml: unknown key task.muscles: did you mean 'muscle'"),
-    "kind.toml": (preset_text(noise={"type": "WhiteNoises"}), "task.noise.type = 'WhiteNoises': did you mean 'WhiteNoise'"),
+    "task.toml": (
+        preset_text(task="isometrics"),
+        "task.toml: task = 'isometrics': did you mean 'isometric'",
+    ),
+    "key.toml": (
+        preset_text(muscles=1),
+        "key.toml: unknown key task.muscles: did you mean 'muscle'",
+    ),
+    "kind.toml": (
+        preset_text(noise={"type": "WhiteNoises"}),
+        "task.noise.type = 'WhiteNoises': did you mean 'WhiteNoise'",
+    ),
     "value.toml": (preset_text(noise=NOISE | {"rate": -1.0}), "task.noise: .*rate = -1.0 Hz"),
-    "missing.toml": (preset_text(noise={"type": "BandLimitedNoise", "rate": 1.0}), "task.noise has no key 'amplitude'"),
-    "entry.toml": (preset_text(harmonic={"type": "Harmonic", "amplitudes": 1}), "task.harmonic.amplitudes: did you mean"),
+    "missing.toml": (
+        preset_text(noise={"type": "BandLimitedNoise", "rate": 1.0}),
+        "task.noise has no key 'amplitude'",
+    ),
+    "entry.toml": (
+        preset_text(harmonic={"type": "Harmonic", "amplitudes": 1}),
+        "task.harmonic.amplitudes: did you mean",
+    ),
     "setting.toml": (
         preset_text(settings=SETTINGS | {"overlap": 1.5}),
         "setting.toml: task.settings: overlap=1.5: give",
@@ -702,19 +884,24 @@ def test_an_unknown_preset_names_the_nearest(monkeypatch):
     from jaxmuscle.response import _presets as _preset
 
     monkeypatch.setattr(_preset, "list_presets", lambda: ("zagrodny-hamilton", "zagrodny-slifkin"))
-    with pytest.raises(PresetError, match=r"'zagrodny-slifki': did you mean 'zagrodny-slifkin'.*or give a path"):
+    with pytest.raises(
+        PresetError, match=r"'zagrodny-slifki': did you mean 'zagrodny-slifkin'.*or give a path"
+    ):
         jm.load_preset("zagrodny-slifki")
 
 
-@pytest.mark.parametrize(("ends", "words"), [
-    ((11.968, 12.0628), "11.97 to 12.06"),  # three digits of each would say 12 to 12.1
-    ((0.6381, 1.2812), "0.638 to 1.28"),
-    ((-0.0004, 0.0), "-0.0004 to 0"),
-    ((1e5, 1e5), "1e+05 to 1e+05"),
-    ((0.3112, None), "above 0.311"),
-    ((None, 12.0628), "below 12.1"),
-    ((None, None), "open"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("ends", "words"),
+    [
+        ((11.968, 12.0628), "11.97 to 12.06"),  # three digits of each would say 12 to 12.1
+        ((0.6381, 1.2812), "0.638 to 1.28"),
+        ((-0.0004, 0.0), "-0.0004 to 0"),
+        ((1e5, 1e5), "1e+05 to 1e+05"),
+        ((0.3112, None), "above 0.311"),
+        ((None, 12.0628), "below 12.1"),
+        ((None, None), "open"),
+    ],
+)
 def test_the_ends_of_an_interval_can_be_told_apart(ends, words):
     assert Estimate(1.0, "N", 0.1, interval=ends).interval_in_words() == words
 
@@ -725,4 +912,6 @@ def test_a_harmonic_that_may_be_elsewhere_says_with_which_probability(share, wor
     said = may_be_elsewhere(share)
     assert f"a probability of {words} it is more than a bin" in said
     stated = "So no standard errors are stated for the harmonic"
-    assert said.endswith(f"{stated} (a probability above 0.1 % is enough for that)" if share < 0.1 else stated)
+    assert said.endswith(
+        f"{stated} (a probability above 0.1 % is enough for that)" if share < 0.1 else stated
+    )

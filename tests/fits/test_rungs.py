@@ -1,4 +1,5 @@
-"""The ladder: the base model while it describes the data, then activation, tremor and a second resonance."""
+"""The ladder: the base model while it describes the data, then activation, tremor and a second
+resonance."""
 
 import functools
 from typing import Any
@@ -51,7 +52,12 @@ def expected(task: jm.Isometric) -> np.ndarray:
 @functools.cache
 def climbed_and_told() -> tuple[jm.fits.FitResult, list[tuple[str, float]]]:
     told: list[tuple[str, float]] = []
-    result = jm.fit(TASK, drawn(expected(with_tremor()), 90, 1), progress=lambda *said: told.append(said), **QUICK)
+    result = jm.fit(
+        TASK,
+        drawn(expected(with_tremor()), 90, 1),
+        progress=lambda *said: told.append(said),
+        **QUICK,
+    )
     return result, told
 
 
@@ -65,11 +71,17 @@ def climbed() -> jm.fits.FitResult:
 def test_every_rung_adds_its_part():
     assert jm.on_rung(TASK, 0) is TASK
     first, second, third = (jm.on_rung(TASK, rung) for rung in (1, 2, 3))
-    added = [set(b.parameter_names) - set(a.parameter_names) for a, b in ((TASK, first), (first, second), (second, third))]
+    added = [
+        set(b.parameter_names) - set(a.parameter_names)
+        for a, b in ((TASK, first), (first, second), (second, third))
+    ]
     assert added[0] == {"activation_time"}
     assert added[1] == {f"resonance_{what}" for what in ("amplitude", "frequency", "width")}
     assert added[2] == {f"resonance_2_{what}" for what in ("amplitude", "frequency", "width")}
-    assert first["harmonic_amplitude"] > 0 and second["harmonic_amplitude"] == third["harmonic_amplitude"] == 0
+    assert (
+        first["harmonic_amplitude"] > 0
+        and second["harmonic_amplitude"] == third["harmonic_amplitude"] == 0
+    )
 
 
 @pytest.mark.parametrize("rung", [-1, len(RUNGS)])
@@ -111,7 +123,8 @@ def test_the_base_model_is_kept_where_it_describes_the_data():
 
 @pytest.mark.parametrize(("asked", "found"), [(8, 8), (50, 32), (100, 32), (300, 96)])
 def test_more_starts_count_for_every_model(asked, found):
-    """A third of those of the first model, since the best one so far is among them; but 32 where there are as many."""
+    """A third of those of the first model, since the best one so far is among them; but 32 where
+    there are as many."""
     assert _fewer(asked) == found
 
 
@@ -127,7 +140,10 @@ def test_a_tremor_is_climbed_to_and_found():
     text = str(result)
     assert "models tried" in text and "-> 2 with tremor instead of the harmonic" in text
     poorer, words = result.ladder[1], " ".join(text.split())
-    assert f"with tremor instead of the harmonic the AIC falls by {poorer.aic - chosen.aic:.1f} (chi2 per bin" in words
+    assert (
+        f"with tremor instead of the harmonic the AIC falls by {poorer.aic - chosen.aic:.1f} (chi2"
+        " per bin" in words
+    )
 
 
 @pytest.mark.slow
@@ -138,12 +154,14 @@ def test_the_progress_says_which_model_it_is_at_and_never_falls_back():
     models = [text.partition(":")[0] for text, _ in told if text.startswith("model ")]
     assert list(dict.fromkeys(models)) == [f"model {k} (of models 0 to 3)" for k in (0, 1, 2)]
     assert "model 1 (of models 0 to 3): with activation" in dict(told)
-    assert max(share for text, share in told if text.startswith("model 2")) <= 3 / 4 * 0.6  # the descents' share of a fit
+    # the descents' share of a fit
+    assert max(share for text, share in told if text.startswith("model 2")) <= 3 / 4 * 0.6
 
 
 @pytest.mark.slow
 def test_a_significant_line_is_tried_against_the_tremor():
-    """A short recording of a tremor: the base model describes it, with a line. Rung 1 has it, too, so rung 2 is tried."""
+    """A short recording of a tremor: the base model describes it, with a line. Rung 1 has it, too,
+    so rung 2 is tried."""
     with without_intervals():
         result = jm.fit(TASK, drawn(expected(with_tremor()), 12, 0), **QUICK)
     first, tremor = result.ladder
@@ -154,14 +172,19 @@ def test_a_significant_line_is_tried_against_the_tremor():
 @pytest.mark.slow
 def test_a_chosen_model_or_noise_is_not_climbed_from():
     target = drawn(expected(with_tremor()), 90, 1)
-    for asked in ({"noise": "band-limited"}, {"free": ("c_w", "noise_K_w", "noise_K_z")}, {"rungs": 0}):
+    for asked in (
+        {"noise": "band-limited"},
+        {"free": ("c_w", "noise_K_w", "noise_K_z")},
+        {"rungs": 0},
+    ):
         with without_intervals():
             assert jm.fit(TASK, target, **asked, **QUICK | {"starts": 2}).ladder == ()
 
 
 @pytest.mark.slow
 def test_the_criterion_is_akaikes(x64):
-    """-2 ln L with scipy's gamma laws joined by their normal scores, and the trace of the hat matrix by differences."""
+    """-2 ln L with scipy's gamma laws joined by their normal scores, and the trace of the hat
+    matrix by differences."""
     target = drawn(expected(TASK), 12, 5)
     problem = planned(TASK, target, FitOptions(free=("c_w", "noise_K_z"))).problem
     objective = problem.linear()
@@ -184,7 +207,8 @@ def test_alike_is_said_and_different_is_said():
 
 
 def tried(*aics: tuple[int, float], chosen: int) -> tuple[Rung, ...]:
-    """Models of these numbers and AICs; the chi² of each is a tenth of the distance of its AIC from -100."""
+    """Models of these numbers and AICs; the chi² of each is a tenth of the distance of its AIC from
+    -100."""
     return tuple(Rung(n, f"{n}", aic, 5.0, (aic + 100) / 10, 0.3, n == chosen) for n, aic in aics)
 
 
@@ -192,10 +216,16 @@ def test_every_part_of_the_chosen_model_says_what_it_gains_over_the_poorer_one()
     said = gains(tried((0, -10.0), (1, -60.0), (2, -59.5), (3, -90.0), chosen=2), describes=True)
     assert said[:-1] == (
         "with activation the AIC falls by 50.0 (chi2 per bin 4.00 instead of 9.00)",
-        "with tremor instead of the harmonic the AIC rises by 0.5 (chi2 per bin 4.05 instead of 4.00)",
+        (
+            "with tremor instead of the harmonic the AIC rises by 0.5 (chi2 per bin 4.05 instead of"
+            " 4.00)"
+        ),
     )
     assert "A richer model can fit worse here" in said[-1]
-    assert f"2 or less says nothing. jaxmuscle compare is stricter: it needs at least {NEEDED:g}, and" in said[-1]
+    assert (
+        f"2 or less says nothing. jaxmuscle compare is stricter: it needs at least {NEEDED:g}, and"
+        in said[-1]
+    )
     assert "no p-value" in said[-1] and "No model" not in said[-1]
 
 
@@ -203,8 +233,10 @@ def test_what_a_part_gains_is_counted_from_the_best_model_without_it():
     worse = gains(tried((0, -60.0), (1, -50.0), (2, -90.0), chosen=2), describes=True)
     assert worse[:-1] == (
         "with activation the AIC rises by 10.0 (chi2 per bin 5.00 instead of 4.00)",
-        "with tremor instead of the harmonic the AIC falls by 30.0 against the best model before (0) (chi2 per bin 1.00 "
-        "instead of 4.00)",
+        (
+            "with tremor instead of the harmonic the AIC falls by 30.0 against the best model"
+            " before (0) (chi2 per bin 1.00 instead of 4.00)"
+        ),
     )
 
 
@@ -213,23 +245,29 @@ def test_an_active_mass_far_from_its_prior_is_told():
     coordinates = Coordinates.of({"k_w": 5e5, "m_w": 0.5}, {}, {"k_w": 1.0, "m_w": 0.5})
     assert coordinates.names == names
     (said,) = mass_notices(coordinates, np.array([9.0, 5.0]))
-    assert said.startswith("m_w went to 6.1 kg, 5 standard deviations of its prior from the 0.5 kg")  # 0.5 exp(5/2)
+    # 0.5 exp(5/2)
+    assert said.startswith("m_w went to 6.1 kg, 5 standard deviations of its prior from the 0.5 kg")
     assert mass_notices(coordinates, 2.9 * one) == ()
 
 
 def test_a_model_that_is_missing_in_the_table_is_explained():
     (said,) = passed_over(tried((0, -10.0), (2, -60.0), chosen=2))
-    assert said == ("model 0 already describes the data, so model 1 was not tried. But the harmonic of model 0 is "
-                    "significant (p < 0.05) and may be a tremor, so model 2 was tried as well")  # fmt: skip
+    assert (
+        said
+        == "model 0 already describes the data, so model 1 was not tried. But the harmonic of model"
+        " 0 is significant (p < 0.05) and may be a tremor, so model 2 was tried as well"
+    )
     assert passed_over(tried((0, -10.0), (1, -20.0), chosen=1)) == ()
     failed = tuple(rung._replace(p=0.001) for rung in tried((0, -10.0), (2, -60.0), chosen=2))
     assert passed_over(failed) == ()  # it was tried, and had no finite spectrum
 
 
 def test_what_was_not_tried_is_counted_with_the_next_model():
-    (gain, _) = gains(tried((0, -10.0), (2, -60.0), chosen=2), describes=True)
-    assert gain.startswith("with activation and with tremor instead of the harmonic the AIC falls by 50.0 (")
-    (gain, _) = gains(tried((-1, -10.0), (0, -20.0), chosen=0), describes=True)
+    gain, _ = gains(tried((0, -10.0), (2, -60.0), chosen=2), describes=True)
+    assert gain.startswith(
+        "with activation and with tremor instead of the harmonic the AIC falls by 50.0 ("
+    )
+    gain, _ = gains(tried((-1, -10.0), (0, -20.0), chosen=0), describes=True)
     assert gain.startswith("with a harmonic the AIC falls by 10.0 (")
 
 
@@ -240,25 +278,42 @@ def test_nothing_is_gained_where_the_simplest_model_was_chosen_or_only_one_was_f
 
 def test_where_no_model_describes_the_data_a_lower_aic_does_not_show_a_part():
     *_, meaning = gains(tried((0, -10.0), (1, -60.0), chosen=1), describes=False)
-    assert "No model that was tried describes the data" in meaning and "not that the muscle has this part" in meaning
+    assert (
+        "No model that was tried describes the data" in meaning
+        and "not that the muscle has this part" in meaning
+    )
 
 
 # --- is the twitch one of human muscle?
 
 
-@pytest.mark.parametrize(("interval", "words"), [
-    ((0.15, 0.31), "(0.15 to 0.31 s) is longer than in human muscle, 0.05 to 0.11 s. It also stands for"),
-    ((0.111, None), "(above 0.111 s) is longer"),
-    ((0.01, 0.049), "(0.01 to 0.049 s) is shorter than in human muscle, 0.05 to 0.11 s. The relaxation"),
-    ((None, 0.03), "(below 0.03 s) is shorter"),
-    ((0.09, 0.31), ""),
-    ((0.01, 0.06), ""),
-    ((None, 0.31), ""),
-    (None, ""),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("interval", "words"),
+    [
+        (
+            (0.15, 0.31),
+            "(0.15 to 0.31 s) is longer than in human muscle, 0.05 to 0.11 s. It also stands for",
+        ),
+        ((0.111, None), "(above 0.111 s) is longer"),
+        (
+            (0.01, 0.049),
+            "(0.01 to 0.049 s) is shorter than in human muscle, 0.05 to 0.11 s. The relaxation",
+        ),
+        ((None, 0.03), "(below 0.03 s) is shorter"),
+        ((0.09, 0.31), ""),
+        ((0.01, 0.06), ""),
+        ((None, 0.31), ""),
+        (None, ""),
+    ],
+)
 def test_a_contraction_time_that_no_human_twitch_has_is_told(interval, words):
     whole = Estimate(0.6, "Hz", 0.1, interval=(0.4, 0.8))
-    told = twitch_notices({"contraction_time": Estimate(0.2, "s", 0.03, interval=interval), "half_power_frequency": whole})
+    told = twitch_notices(
+        {
+            "contraction_time": Estimate(0.2, "s", 0.03, interval=interval),
+            "half_power_frequency": whole,
+        }
+    )
     assert len(told) == bool(words)
     assert all(words in one and one.startswith("contraction_time (") for one in told)
     assert all("What to do: report half_power_frequency" in one for one in told)
@@ -266,14 +321,20 @@ def test_a_contraction_time_that_no_human_twitch_has_is_told(interval, words):
 
 def test_no_remedy_names_what_the_fit_does_not_have():
     slow = Estimate(0.2, "s", 0.03, interval=(0.15, 0.31))
-    (told,) = twitch_notices({"contraction_time@a": slow, "contraction_time@b": Estimate(0.2, "s", interval=(0.15, 0.31))})
+    (told,) = twitch_notices(
+        {
+            "contraction_time@a": slow,
+            "contraction_time@b": Estimate(0.2, "s", interval=(0.15, 0.31)),
+        }
+    )
     assert told.startswith("contraction_time@a ") and "half_power_frequency" not in told
     assert "What to do: hold activation_time" in told
 
 
 @pytest.mark.slow
 def test_a_slow_twitch_is_told_by_the_fit():
-    """A twitch of 0.25 s and ten times as many segments as above, so that the interval excludes that of human muscle."""
+    """A twitch of 0.25 s and ten times as many segments as above, so that the interval excludes
+    that of human muscle."""
     task = jm.on_rung(TASK, 2).replace(activation_time=0.25, noise_K_z=5e-4, **TREMOR)
     result = jm.fit(task, drawn(expected(task), 900, 1), **QUICK)
     low, _ = result.derived["contraction_time"].interval or (None, None)
@@ -291,8 +352,17 @@ def test_components_add_up_and_are_what_their_noise_alone_gives(x64):
     assert set(parts) == {"relaxation", "floor", "harmonic", "tremor"}
     np.testing.assert_allclose(sum(parts.values()), 1.0, rtol=1e-9)
     task = result.task
-    alone = task.replace(**{n: 0.0 for n in task.parameter_names if n.startswith("noise_") and n[6:8] in ("K_", "C_")})
-    whole, own = (np.asarray(expected_moments(t, result.target.settings, WINDOW)[0].power) for t in (task, alone))
+    alone = task.replace(
+        **{
+            n: 0.0
+            for n in task.parameter_names
+            if n.startswith("noise_") and n[6:8] in ("K_", "C_")
+        }
+    )
+    whole, own = (
+        np.asarray(expected_moments(t, result.target.settings, WINDOW)[0].power)
+        for t in (task, alone)
+    )
     np.testing.assert_allclose(parts["tremor"], own / whole, rtol=1e-9)
 
 
@@ -326,7 +396,8 @@ def test_a_band_that_is_hardly_covered_is_left_out():
 
 @pytest.mark.slow
 def test_bands_are_integrals_over_bins():
-    """A bin's power is spread evenly over its width: up to a frequency there is the linearly interpolated sum."""
+    """A bin's power is spread evenly over its width: up to a frequency there is the linearly
+    interpolated sum."""
     result = climbed()
     f, p = result.frequency_hz, result.fitted
     edges = np.append(f - 0.5 * f[0], f[-1] + 0.5 * f[0])
@@ -337,7 +408,10 @@ def test_bands_are_integrals_over_bins():
     said = " ".join(str(result).partition("not determined")[0].split())
     # The first band holds the first bin (0.39 Hz, 0.39 Hz wide) up to 0.5 Hz: 0.78 of it.
     measured = (0.5 / result.target.settings.resolution - 0.5) * result.target.proportional_power[0]
-    assert f"power by band, fitted (measured): 0-0.5 Hz {100 * result.derived['band_0_0.5'].value:.2g} %" in said
+    assert (
+        "power by band, fitted (measured): 0-0.5 Hz"
+        f" {100 * result.derived['band_0_0.5'].value:.2g} %" in said
+    )
     assert f"% ({100 * measured:.2g} %), 0.5-1 Hz" in said and "band_" not in said
 
 
@@ -346,16 +420,26 @@ def test_all_that_follows_a_fit_takes_a_model_with_tremor(tmp_path):
     result = climbed()
     result.save(tmp_path / "fit.json")
     assert str(jm.load_result(tmp_path / "fit.json")) == str(result)
-    assert jm.load_preset(tmp_path / "fit.json")["resonance_frequency"] == pytest.approx(result.task["resonance_frequency"])
+    assert jm.load_preset(tmp_path / "fit.json")["resonance_frequency"] == pytest.approx(
+        result.task["resonance_frequency"]
+    )
     profiled = jm.profile(result, "resonance_frequency")
     assert str(profiled)
     assert jm.goodness(result, replicates=19).p_value > 0
     # Those that need no program of another task: at other forces, and for longer.
-    same = [design for design in jm.standard_designs(result) if design.task is None or type(design.task) is jm.Isometric]
+    same = [
+        design
+        for design in jm.standard_designs(result)
+        if design.task is None or type(design.task) is jm.Isometric
+    ]
     assert len(same) >= 3
-    told = jm.identifiability(result, designs=[design for design in same if design.lengthening is None]).told
+    told = jm.identifiability(
+        result, designs=[design for design in same if design.lengthening is None]
+    ).told
     assert "tremor_frequency" in told and "resonance_frequency" not in told
     with without_intervals():
         cohort = jm.fit_cohort([result.target], starts=8, rung=2)
     (found,) = cohort.results.values()
-    assert found.derived["tremor_frequency"].value == pytest.approx(result.derived["tremor_frequency"].value, abs=0.2)
+    assert found.derived["tremor_frequency"].value == pytest.approx(
+        result.derived["tremor_frequency"].value, abs=0.2
+    )

@@ -1,4 +1,5 @@
-"""Studies: comparisons are those of scipy, corrections those of their papers, a folder is whole or as it was."""
+"""Studies: comparisons are those of scipy, corrections those of their papers, a folder is whole or
+as it was."""
 
 import csv
 import dataclasses
@@ -21,8 +22,16 @@ from jaxmuscle.fits._differences import corrected
 from jaxmuscle.fits._study import USUAL, _checked
 
 PEOPLE, CONDITIONS = 5, ("rest", "tired")
-OPTIONS = {"rung": "auto", "noise": None, "quantities": ["corner_frequency"], "alpha": 0.05, "correction": "holm",
-           "starts": 8, "key": 0, "reading": {}}  # fmt: skip
+OPTIONS = {
+    "rung": "auto",
+    "noise": None,
+    "quantities": ["corner_frequency"],
+    "alpha": 0.05,
+    "correction": "holm",
+    "starts": 8,
+    "key": 0,
+    "reading": {},
+}
 
 
 def values(seed=0):
@@ -37,14 +46,22 @@ def values(seed=0):
 
 
 def made_study(numbers=None, left_out=(), **options):
-    """A study whose fits have these corner frequencies; those of `left_out` do not determine them."""
+    """A study whose fits have these corner frequencies; those of `left_out` do not determine
+    them."""
     cells, results = [], {}
     rng = np.random.default_rng(3)
     for (person, group), both in (values() if numbers is None else numbers).items():
         for condition, value in zip(CONDITIONS, both, strict=True):
             name = f"{person}, {condition}"
             power = np.exp(0.1 * rng.standard_normal((2, 30))) / (1 + np.arange(1, 31) ** 2)
-            target = jm.Target(name, power.mean(axis=0), segments=[6, 6], unit="N", trial_power=power, mean=[5.0, 5.1])
+            target = jm.Target(
+                name,
+                power.mean(axis=0),
+                segments=[6, 6],
+                unit="N",
+                trial_power=power,
+                mean=[5.0, 5.1],
+            )
             error = None if name in left_out else 0.02
             other = Estimate(9 + value + 0.1 * rng.standard_normal(), "Hz", 0.5)
             derived = {"corner_frequency": Estimate(value, "Hz", error), "tremor_frequency": other}
@@ -70,9 +87,13 @@ def test_groups_are_compared_by_welch_in_each_condition():
         (condition, "young", "old", (PEOPLE, PEOPLE), "Hz") for condition in CONDITIONS
     ]
     for number, d in enumerate(found):
-        test = scipy.stats.ttest_ind(column("old", number), column("young", number), equal_var=False)
+        test = scipy.stats.ttest_ind(
+            column("old", number), column("young", number), equal_var=False
+        )
         interval = test.confidence_interval(0.95)
-        np.testing.assert_allclose((d.p, d.low, d.high), (test.pvalue, interval.low, interval.high), rtol=1e-9)
+        np.testing.assert_allclose(
+            (d.p, d.low, d.high), (test.pvalue, interval.low, interval.high), rtol=1e-9
+        )
 
 
 def test_conditions_are_compared_within_people():
@@ -90,7 +111,9 @@ def test_the_interaction_is_the_difference_of_changes():
     old, young = (np.subtract(column(g, 1), column(g, 0)) for g in ("old", "young"))
     test = scipy.stats.ttest_ind(old, young, equal_var=False)
     interval = test.confidence_interval(0.9)
-    np.testing.assert_allclose((d.p, d.low, d.high), (test.pvalue, interval.low, interval.high), rtol=1e-9)
+    np.testing.assert_allclose(
+        (d.p, d.low, d.high), (test.pvalue, interval.low, interval.high), rtol=1e-9
+    )
     assert (d.a, d.b, d.where) == ("young", "old", "tired - rest")
 
 
@@ -106,15 +129,22 @@ def test_what_a_fit_does_not_determine_is_left_out_and_counted():
     assert "differences" not in str(made_study(left_out=[cell.target.name for cell in study.cells]))
 
 
-# Holm: 0.01 x 4, then the largest so far of 0.02 x 3, 0.03 x 2, 0.04 x 1; the p-values in another order.
+# Holm: 0.01 x 4, then the largest so far of 0.02 x 3, 0.03 x 2, 0.04 x 1; the p-values in another
+# order.
 @pytest.mark.parametrize(
     ("correction", "expected"),
-    [("holm", [0.06, 0.04, 0.06, 0.06]), ("fdr", [0.04, 0.04, 0.04, 0.04]), ("none", [0.03, 0.01, 0.04, 0.02])],
+    [
+        ("holm", [0.06, 0.04, 0.06, 0.06]),
+        ("fdr", [0.04, 0.04, 0.04, 0.04]),
+        ("none", [0.03, 0.01, 0.04, 0.02]),
+    ],
 )
 def test_corrections(correction, expected):
     (one,) = of(made_study(), "conditions")
     family = [dataclasses.replace(one, p=p) for p in (0.03, 0.01, 0.04, 0.02)]
-    np.testing.assert_allclose([d.p_corrected for d in corrected(family, correction)], expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        [d.p_corrected for d in corrected(family, correction)], expected, rtol=1e-12
+    )
     assert corrected([], correction) == []
 
 
@@ -132,17 +162,33 @@ def test_every_kind_of_comparison_is_corrected_by_itself():
 def test_tables():
     study = made_study()
     rows = study.table()
-    assert {"person", "group", "condition", "trials", "quantity", "value", "stderr", "adequate"} <= set(rows[0])
+    assert {
+        "person",
+        "group",
+        "condition",
+        "trials",
+        "quantity",
+        "value",
+        "stderr",
+        "adequate",
+    } <= set(rows[0])
     assert len(study.to_dataframe()) == len(rows)
-    frame = study.to_dataframe().query("quantity == 'corner_frequency' and condition == 'tired' and group == 'old'")
+    frame = study.to_dataframe().query(
+        "quantity == 'corner_frequency' and condition == 'tired' and group == 'old'"
+    )
     np.testing.assert_array_equal(frame["value"], column("old", 1))
-    assert {row["quantity"] for row in made_study(quantities=["corner_frequency"]).table()} == {"corner_frequency"}
+    assert {row["quantity"] for row in made_study(quantities=["corner_frequency"]).table()} == {
+        "corner_frequency"
+    }
     assert study.rung == 1 and study.people["old0"] == "old" and study.success
 
 
 def test_a_quantity_is_asked_for_by_either_name():
     asked = ["resonance_frequency", "tremor_frequency", "corner_frequency"]
-    assert _checked(USUAL | {"quantities": asked})["quantities"] == ["tremor_frequency", "corner_frequency"]
+    assert _checked(USUAL | {"quantities": asked})["quantities"] == [
+        "tremor_frequency",
+        "corner_frequency",
+    ]
 
 
 @pytest.mark.slow
@@ -166,11 +212,22 @@ def test_the_folder(tmp_path):
         assert (row["kind"], row["quantity"], row["where"]) == (d.kind, d.quantity, d.where)
         assert float(row["p_corrected"]) == pytest.approx(d.p_corrected, rel=1e-7)
     table = json.loads((tmp_path / "study.json").read_text())
-    assert len(table["fits"]) == 4 * PEOPLE and table["model"]["rung"] == 1 and table["aic"] == {"0": 10.0, "1": -3.5}
+    assert (
+        len(table["fits"]) == 4 * PEOPLE
+        and table["model"]["rung"] == 1
+        and table["aic"] == {"0": 10.0, "1": -3.5}
+    )
     assert "nothing to compare" in str(made_study(alpha=0.05, quantities=["tremor_share"]))
     methods = " ".join((tmp_path / "methods.txt").read_text().split())
-    for said in ("10 people in 2 groups (young 5, old 5) in 2 conditions", "40 recordings, 2 per person", "Holm",
-                 "paired t test", "Welch", "with activation", f"jaxmuscle {jm.__version__}"):  # fmt: skip
+    for said in (
+        "10 people in 2 groups (young 5, old 5) in 2 conditions",
+        "40 recordings, 2 per person",
+        "Holm",
+        "paired t test",
+        "Welch",
+        "with activation",
+        f"jaxmuscle {jm.__version__}",
+    ):
         assert said in methods, said
 
 
@@ -179,7 +236,12 @@ def test_a_study_without_differences_leaves_none_of_an_earlier_one(tmp_path):
     made_study().save(tmp_path)
     (tmp_path / "mine.csv").write_text("kept")
     made_study(quantities=["tremor_share"]).save(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"study.json", "methods.txt", "spectra.png", "mine.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "study.json",
+        "methods.txt",
+        "spectra.png",
+        "mine.csv",
+    }
 
 
 @pytest.mark.slow
@@ -206,7 +268,11 @@ def test_the_figure_of_spectra():
         legend = [text.get_text() for text in figure.legends[0].get_texts()]
         assert legend == [f"young ({PEOPLE} people)", f"old ({PEOPLE} people)"]
         thick = next(line for line in figure.axes[1].lines if line.get_label().startswith("old"))
-        rows = [c.target.trial_power.mean(axis=0) for c in study.cells if (c.group, c.condition) == ("old", "tired")]
+        rows = [
+            c.target.trial_power.mean(axis=0)
+            for c in study.cells
+            if (c.group, c.condition) == ("old", "tired")
+        ]
         np.testing.assert_allclose(thick.get_ydata(), scipy.stats.gmean(rows), rtol=1e-12)
     finally:
         plt.close(figure)
@@ -241,13 +307,26 @@ def forces():
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
-    rows, whose = [], [(p, g, c, t) for p, g in zip("abcd", "xxyy", strict=True) for c in CONDITIONS for t in "12"]
-    for number, (force, (person, group, condition, trial)) in enumerate(zip(forces(), whose, strict=True)):
+    rows, whose = (
+        [],
+        [
+            (p, g, c, t)
+            for p, g in zip("abcd", "xxyy", strict=True)
+            for c in CONDITIONS
+            for t in "12"
+        ],
+    )
+    for number, (force, (person, group, condition, trial)) in enumerate(
+        zip(forces(), whose, strict=True)
+    ):
         np.save(folder / f"{number}.npy", force)
         rows.append(f"{number}.npy,{person},{group},{condition},{trial}")
-    (folder / "study.csv").write_text("\n".join(["file,person,group,condition,trial", *rows]) + "\n")
+    (folder / "study.csv").write_text(
+        "\n".join(["file,person,group,condition,trial", *rows]) + "\n"
+    )
     (folder / "study.toml").write_text(
-        'table = "study.csv"\nrate = 100.0\nunits = "N m"\nrung = 0\nquantities = ["corner_frequency"]\n'
+        'table = "study.csv"\nrate = 100.0\nunits = "N m"\nrung = 0\nquantities ='
+        ' ["corner_frequency"]\n'
     )
     return folder
 
@@ -256,16 +335,29 @@ def recorded(tmp_path_factory):
 def test_a_whole_study_as_the_page_does_it(recorded, monkeypatch):
     monkeypatch.chdir(recorded)
     with without_intervals():
-        found = pages.run("docs/study.md", smaller={'run_study("study.toml")': 'run_study("study.toml", starts=8)'})["found"]
+        found = pages.run(
+            "docs/study.md",
+            smaller={'run_study("study.toml")': 'run_study("study.toml", starts=8)'},
+        )["found"]
         alone = jm.fit_cohort([found.cells[3].target], starts=8).results["b, tired"]
     plt.close("all")
-    assert found.rung == 0 and set(found.aic) == {0} and found.options["reading"] == {"rate": 100.0, "units": "N m"}
-    assert [(c.person, c.condition, c.trials) for c in found.cells] == [(p, c, 2) for p in "abcd" for c in CONDITIONS]
+    assert (
+        found.rung == 0
+        and set(found.aic) == {0}
+        and found.options["reading"] == {"rate": 100.0, "units": "N m"}
+    )
+    assert [(c.person, c.condition, c.trials) for c in found.cells] == [
+        (p, c, 2) for p in "abcd" for c in CONDITIONS
+    ]
     (rung,) = found.cohort.results["b, tired"].ladder
     assert rung.chosen and rung.aic == pytest.approx(alone.ladder[0].aic, abs=1e-3)
     assert np.isclose(found.aic[0], sum(r.ladder[0].aic for r in found.cohort.results.values()))
     assert "with the same model (base: noise and a harmonic)" in found.methods()
     assert "Study: 4 people in 2 groups (x 2, y 2) in 2 conditions (rest, tired)" in str(found)
-    assert {"people.csv", "study.json", "spectra.png", "methods.txt"} <= {p.name for p in (recorded / "out/study").iterdir()}
+    assert {"people.csv", "study.json", "spectra.png", "methods.txt"} <= {
+        p.name for p in (recorded / "out/study").iterdir()
+    }
     table = json.loads((recorded / "out/study/study.json").read_text())
-    assert len(table["fits"]) == 8 and all(np.isfinite(fit["fitted"]).all() for fit in table["fits"])
+    assert len(table["fits"]) == 8 and all(
+        np.isfinite(fit["fitted"]).all() for fit in table["fits"]
+    )

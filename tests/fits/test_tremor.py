@@ -16,7 +16,8 @@ TRUTH = jm.on_rung(jm.PrescribedForce(observe="acceleration"), 2).replace(**TREM
 
 @functools.cache
 def target() -> jm.Target:
-    """Of a minute of the nonlinear model, in g and with gravity, as a sensor on the finger has it."""
+    """Of a minute of the nonlinear model, in g and with gravity, as a sensor on the finger has
+    it."""
     run = jm.simulate(jm.settled(TRUTH), jax.random.key(1), duration=65.0)
     samples = np.asarray(run.output, dtype=float)[500:] / 9.81 + 0.7
     return jm.Recording(samples, 100.0, unit="g", name="finger").steady().target()
@@ -32,7 +33,11 @@ def result() -> jm.fits.FitResult:
 def test_the_tremor_is_recovered():
     found = result()
     assert found.success and found.adequate and "PrescribedForce (acceleration)" in str(found)
-    for name, true in (("tremor_frequency", 8.0), ("tremor_width", 1.0), ("contraction_time", 0.06)):
+    for name, true in (
+        ("tremor_frequency", 8.0),
+        ("tremor_width", 1.0),
+        ("contraction_time", 0.06),
+    ):
         q = found.derived[name]
         assert q.stderr is not None and abs(q.value - true) < 4 * q.stderr < 2 * true
         assert name != "tremor_frequency" or q.stderr < 0.2  # half a bin
@@ -51,13 +56,22 @@ def test_its_file_is_the_same_result(tmp_path):
 
 def test_an_acceleration_and_a_displacement_that_look_alike_are_no_batch(x64):
     power = 1 / np.arange(1.0, 31.0)
-    same = [jm.Target(what, power, quantity=what, segments=45) for what in ("acceleration", "displacement")]
+    same = [
+        jm.Target(what, power, quantity=what, segments=45)
+        for what in ("acceleration", "displacement")
+    ]
     plans = [planned(jm.task_for(target), target, FitOptions()) for target in same]
     assert _alike(plans[0]) != _alike(plans[1])
-    assert [plan.problem.parts[0].task.quantity for plan in plans] == ["acceleration", "displacement"]
+    assert [plan.problem.parts[0].task.quantity for plan in plans] == [
+        "acceleration",
+        "displacement",
+    ]
 
 
 @pytest.mark.slow
 def test_the_likelihood_is_highest_near_the_tremor(x64):
-    low, here, high = (float(jm.log_likelihood(TRUTH.replace(resonance_frequency=f), target())) for f in (7.0, 8.0, 9.0))
+    low, here, high = (
+        float(jm.log_likelihood(TRUTH.replace(resonance_frequency=f), target()))
+        for f in (7.0, 8.0, 9.0)
+    )
     assert here > max(low, high) + 3

@@ -47,43 +47,86 @@ class Own(jm.AbstractMuscle):
 @pytest.mark.parametrize(
     "method, wrong, message",
     [
-        ("active_force", lambda self, x, v, u: jnp.stack([x, v]), r"force\(x_w, v_w, u\) returns float32 of shape \(2,\)"),
-        ("active_force", lambda self, x, v, u: None, "returns a NoneType; it must return one floating-point number"),
-        ("active_force", lambda self, x, v, u: x if x > 0 else v, r"decides .* by values.*jnp\.where"),
+        (
+            "active_force",
+            lambda self, x, v, u: jnp.stack([x, v]),
+            r"force\(x_w, v_w, u\) returns float32 of shape \(2,\)",
+        ),
+        (
+            "active_force",
+            lambda self, x, v, u: None,
+            "returns a NoneType; it must return one floating-point number",
+        ),
+        (
+            "active_force",
+            lambda self, x, v, u: x if x > 0 else v,
+            r"decides .* by values.*jnp\.where",
+        ),
         ("active_force", lambda self, x, v, u: np.sin(x), "with `if`, float\\(\\) or numpy"),
-        ("active_force", lambda self, x, v: x, r"cannot be computed: TypeError: .*calls it with one number for each"),
-        ("passive_force", lambda self, x, v, z, w, u: self.stifness * x, "AttributeError: 'Wrong' object has no .*stifness"),
-        ("base", lambda self: [150.0, 150.0, 20.0, 10.0], r"base\(\) returns a list; it must return an array of four"),
+        (
+            "active_force",
+            lambda self, x, v: x,
+            r"cannot be computed: TypeError: .*calls it with one number for each",
+        ),
+        (
+            "passive_force",
+            lambda self, x, v, z, w, u: self.stifness * x,
+            "AttributeError: 'Wrong' object has no .*stifness",
+        ),
+        (
+            "base",
+            lambda self: [150.0, 150.0, 20.0, 10.0],
+            r"base\(\) returns a list; it must return an array of four",
+        ),
         ("base", lambda self: jnp.ones(3), r"base\(\) returns float32 of shape \(3,\)"),
-        ("contraction_velocity", lambda self, x, z, w, F, u: w + (F - 150.0 * (z - x)) / 10.0, "is not the inverse of"),
+        (
+            "contraction_velocity",
+            lambda self, x, z, w, F, u: w + (F - 150.0 * (z - x)) / 10.0,
+            "is not the inverse of",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_muscle_of_ones_own_is_looked_at(method, wrong, message):
     """And once found good it is taken; a class without the fourth method by every task but one."""
     with pytest.raises(ValueError, match=message):
         jm.Isometric(muscle=type("Wrong", (Own,), {method: wrong})())
-    assert jm.Isometric(muscle=Own()).muscle == Own() and jm.PrescribedForce(muscle=Own())["m_z"] == 0.4
-    with pytest.raises(ValueError, match="Own has no method contraction_velocity, which PrescribedMotion needs"):
+    assert (
+        jm.Isometric(muscle=Own()).muscle == Own()
+        and jm.PrescribedForce(muscle=Own())["m_z"] == 0.4
+    )
+    with pytest.raises(
+        ValueError, match="Own has no method contraction_velocity, which PrescribedMotion needs"
+    ):
         jm.PrescribedMotion(muscle=Own())
     assert jax.jit(lambda m: jm.Isometric(muscle=Own(m))["m_w"])(0.3) == pytest.approx(0.3)
 
 
-@pytest.mark.parametrize("wrong, message", [
-    (lambda self: 1.0, r"Law\.__call__\(q\) cannot be computed: TypeError"),
-    (lambda self, q: 100, r"Law\.__call__\(q\) returns int32 of shape \(\); it must return .* \[N/m or N s/m\]"),
-    (lambda self, q: jnp.ones(2) * q, r"Law\.__call__\(q\) returns float32 of shape \(2,\)"),
-    (lambda self, q: q if q > 0 else 0.0, r"decides .* by values.*jnp\.where"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        (lambda self: 1.0, r"Law\.__call__\(q\) cannot be computed: TypeError"),
+        (
+            lambda self, q: 100,
+            r"Law\.__call__\(q\) returns int32 of shape \(\); it must return .* \[N/m or N s/m\]",
+        ),
+        (lambda self, q: jnp.ones(2) * q, r"Law\.__call__\(q\) returns float32 of shape \(2,\)"),
+        (lambda self, q: q if q > 0 else 0.0, r"decides .* by values.*jnp\.where"),
+    ],
+)
 def test_a_law_of_ones_own_is_looked_at(wrong, message):
     law = type("Law", (jm.model.AbstractLaw,), {"__call__": wrong})()
     with pytest.raises(ValueError, match=message):
         jm.Isometric(muscle=jm.Muscle(stiffness_w=law))
 
 
-@pytest.mark.parametrize("name", ["P_w", "noise", "noise_K_w", "harmonic_frequency", "activation_time"])
+@pytest.mark.parametrize(
+    "name", ["P_w", "noise", "noise_K_w", "harmonic_frequency", "activation_time"]
+)
 def test_a_field_of_an_own_muscle_hides_nothing(name):
     named = type("Named", (Own,), {"__annotations__": {name: float}, name: 1.0})
-    with pytest.raises(ValueError, match=rf"Named\.{name}: a task has something of this name itself"):
+    with pytest.raises(
+        ValueError, match=rf"Named\.{name}: a task has something of this name itself"
+    ):
         jm.Isometric(muscle=named())
 
 
@@ -95,7 +138,9 @@ def random_states(count=20):
 
 @pytest.mark.parametrize("argument", ["literal", "elongation"])
 def test_equations_1_and_2(x64, argument):
-    task = jm.PrescribedForce(jm.model.Constant(3.0), jm.model.Constant(-0.7), muscle=jm.Muscle(argument=argument))
+    task = jm.PrescribedForce(
+        jm.model.Constant(3.0), jm.model.Constant(-0.7), muscle=jm.Muscle(argument=argument)
+    )
     for y, u in random_states():
         a_w, a_z = references.accelerations(MUSCLE, y, 3.0, -0.7, u, argument)
         field = task.vector_field(0.3, jnp.asarray(y), jnp.asarray(u))
@@ -106,7 +151,8 @@ def test_equations_1_and_2(x64, argument):
 def test_the_arguments_differ(x64):
     y = jnp.array([0.02, 0.1, 0.01, 0.5])
     literal, elongation = (
-        jm.Muscle(argument=a).passive_force(y[0], y[1], y[2], y[3], jnp.zeros(4)) for a in ("literal", "elongation")
+        jm.Muscle(argument=a).passive_force(y[0], y[1], y[2], y[3], jnp.zeros(4))
+        for a in ("literal", "elongation")
     )
     assert abs(literal - elongation) > 0.1
 
@@ -133,7 +179,9 @@ def test_contraction_velocity_inverts_passive_force(x64, argument, c_z, v_ref_z)
 
     def passed(y, force, u):
         x_w, _, x_z, v_z = y
-        return muscle.passive_force(x_w, muscle.contraction_velocity(x_w, x_z, v_z, force, u), x_z, v_z, u)
+        return muscle.passive_force(
+            x_w, muscle.contraction_velocity(x_w, x_z, v_z, force, u), x_z, v_z, u
+        )
 
     y, u = map(np.array, zip(*random_states(), strict=True))
     # Noise far below the damping: with a negative damping there is no velocity to find.
@@ -150,7 +198,9 @@ def test_a_custom_law_is_a_parameter_in_replace_and_simulate(x64):
     changed = task.replace(stiff_z=150.0, toe_z=20.0)
     assert (changed["stiff_z"], changed["toe_z"]) == (150.0, 20.0)
     np.testing.assert_allclose(changed.muscle.base()[1], 150.0)
-    quiet = changed.replace(**{f"noise_{c}": 0.0 for c in ("K_w", "K_z", "C_w", "C_z")}, harmonic_amplitude=0.0)
+    quiet = changed.replace(
+        **{f"noise_{c}": 0.0 for c in ("K_w", "K_z", "C_w", "C_z")}, harmonic_amplitude=0.0
+    )
     end = np.asarray(jm.simulate(quiet, jax.random.key(0), duration=12.0).states[-1])
     # Statics of (1): K_z(x_z) (x_z - x_w) = -F_ext and K_w(x_w) x_w = P_w - F_ext.
     x_w, x_z = end[0], end[2]
@@ -196,7 +246,11 @@ def test_a_whole_own_muscle_runs_in_every_task():
         task = kind(muscle=Linear()).replace(stiff=120.0)
         assert task["stiff"] == 120.0
         states, zero = np.full(len(task.state_names), 0.01, np.float32), np.zeros(4, np.float32)
-        assert np.isfinite(at_once(lambda states, zero, task=task: task.output(0.8, states, zero, zero), states, zero))
+        assert np.isfinite(
+            at_once(
+                lambda states, zero, task=task: task.output(0.8, states, zero, zero), states, zero
+            )
+        )
     run = jm.simulate(jm.Isometric(muscle=Linear()), jax.random.key(0), duration=0.8)
     assert run.finite and run.output[-1] != 0
 
@@ -209,7 +263,10 @@ def test_a_mass_must_be_positive(field, value):
 
 
 def test_factors_must_not_be_negative():
-    for law, name in ((jm.model.QuadraticStiffness, "k = -1"), (jm.model.QuadraticDamping, "c = -1")):
+    for law, name in (
+        (jm.model.QuadraticStiffness, "k = -1"),
+        (jm.model.QuadraticDamping, "c = -1"),
+    ):
         with pytest.raises(ValueError, match=name):
             law(-1.0)
         with pytest.raises(ValueError, match="_ref = -2"):
@@ -223,7 +280,9 @@ def test_factors_must_not_be_negative():
 def test_an_unknown_parameter_names_the_nearest():
     task = jm.Isometric()
     for use in (lambda: task["k_ww"], lambda: task.replace(k_ww=1.0)):
-        with pytest.raises(ValueError, match=r"unknown parameter 'k_ww' of Isometric: did you mean 'k_w'\?"):
+        with pytest.raises(
+            ValueError, match=r"unknown parameter 'k_ww' of Isometric: did you mean 'k_w'\?"
+        ):
             use()
     with pytest.raises(ValueError, match="did you mean 'harmonic_frequency'"):
         task.replace(harmonic_freq=4.0)
@@ -231,7 +290,9 @@ def test_an_unknown_parameter_names_the_nearest():
         task.replace(F_ext=1.0)
 
 
-@pytest.mark.parametrize("name", [name for name, row in PARAMETERS.items() if np.isfinite(row.lower)])
+@pytest.mark.parametrize(
+    "name", [name for name, row in PARAMETERS.items() if np.isfinite(row.lower)]
+)
 def test_a_value_outside_the_tables_bounds_is_refused(name):
     for task in _tasks():
         if name in task.parameter_names:
@@ -261,16 +322,23 @@ def _tasks():
 
 def _with_everything():
     """Also what is off by default, at the table's values."""
-    second = (PARAMETERS[f"resonance_2_{what}"].default for what in ("amplitude", "frequency", "width"))
+    second = (
+        PARAMETERS[f"resonance_2_{what}"].default for what in ("amplitude", "frequency", "width")
+    )
     noise = jm.BandLimitedNoise() + jm.ResonantNoise() + jm.ResonantNoise(*second)
-    return jm.Isometric(noise=noise, activation=jm.Activation()).replace(noise_P_w=PARAMETERS["noise_P_w"].default)
+    return jm.Isometric(noise=noise, activation=jm.Activation()).replace(
+        noise_P_w=PARAMETERS["noise_P_w"].default
+    )
 
 
-@pytest.mark.parametrize("task", _tasks(), ids=lambda t: f"{type(t).__name__}-{type(t.noise).__name__}")
+@pytest.mark.parametrize(
+    "task", _tasks(), ids=lambda t: f"{type(t).__name__}-{type(t.noise).__name__}"
+)
 def test_replace_sets_the_named_parameter_and_nothing_else(task):
     before = {name: float(value) for name, value in task.parameters.items()}
     for name, value in before.items():
-        rough = name in ("noise_K_z", "noise_C_z", "noise_C_w") and value == 0.0  # noise that the task would refuse
+        # noise that the task would refuse
+        rough = name in ("noise_K_z", "noise_C_z", "noise_C_w") and value == 0.0
         new = 0.0 if rough else 1.25 * value + (0.001 if value == 0 else 0.0)
         after = {key: float(v) for key, v in task.replace(**{name: new}).parameters.items()}
         assert after == before | {name: new}, name
@@ -282,7 +350,8 @@ def test_every_row_of_the_table_is_a_parameter_with_that_default():
     for task in _tasks():
         for name, value in task.parameters.items():
             seen.setdefault(name, float(value))
-    # F_ext of the first task that has one is PrescribedForce's; noise_rate is a convention, not a parameter to fit.
+    # F_ext of the first task that has one is PrescribedForce's; noise_rate is a convention, not a
+    # parameter to fit.
     assert set(seen) - {"noise_rate"} == set(PARAMETERS)
     for name, row in PARAMETERS.items():
         expected = row.default
@@ -304,9 +373,13 @@ def test_the_table_is_consistent():
 
 
 def test_with_parts_and_as_task_keep_what_they_do_not_name():
-    task = jm.PrescribedMotion(0.004, 7.0, noise=jm.BandLimitedNoise(0.02), harmonic=jm.Harmonic(0.01, 6.0))
+    task = jm.PrescribedMotion(
+        0.004, 7.0, noise=jm.BandLimitedNoise(0.02), harmonic=jm.Harmonic(0.01, 6.0)
+    )
     other = task.with_parts(harmonic=jm.Harmonic(0.02, 5.0))
-    assert other["harmonic_frequency"] == 5.0 and other["F_ext"] == 7.0 and other["noise_K_w"] == 0.02
+    assert (
+        other["harmonic_frequency"] == 5.0 and other["F_ext"] == 7.0 and other["noise_K_w"] == 0.02
+    )
     assert task["harmonic_frequency"] == 6.0
     turned = task.as_task(jm.PrescribedForce, P_w=jm.model.Constant(2.0))
     assert isinstance(turned, jm.PrescribedForce)
@@ -318,11 +391,15 @@ def test_with_parts_and_as_task_keep_what_they_do_not_name():
 def test_the_base_coefficients_are_k_times_reference_squared(x64):
     task = jm.Isometric().replace(k_w=3e5, x_ref_w=0.03, c_z=7.0, v_ref_z=0.5)
     np.testing.assert_allclose(task.muscle.base(), [270.0, 200.0, 60.0, 1.75], rtol=1e-14)
-    np.testing.assert_allclose(task.noise_scale(), [270.0 * 0.15, 200.0 * 0.005, 60e-4, 1.75e-4], rtol=1e-14)
+    np.testing.assert_allclose(
+        task.noise_scale(), [270.0 * 0.15, 200.0 * 0.005, 60e-4, 1.75e-4], rtol=1e-14
+    )
     np.testing.assert_allclose(task.harmonic_base(), [270.0, 200.0, 0.0, 0.0, 0.0], rtol=1e-14)
 
 
 def test_initial_state_has_the_tasks_length():
     with pytest.raises(ValueError, match="initial has 3 entries"):
         jm.Isometric(initial=(0.0, 0.0, 0.0))
-    np.testing.assert_allclose(jm.Isometric(initial=(0.01, 0.2)).initial_state(), [0.01, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(
+        jm.Isometric(initial=(0.01, 0.2)).initial_state(), [0.01, 0.2], rtol=1e-6
+    )

@@ -1,4 +1,5 @@
-"""Noise against its closed forms: density, variance, autocovariance, slopes; channels and amplitudes."""
+"""Noise against its closed forms: density, variance, autocovariance, slopes; channels and
+amplitudes."""
 
 from typing import ClassVar
 
@@ -27,7 +28,9 @@ OU = jm.OrnsteinUhlenbeckNoise(1.0, 0.05)
 
 def unit_paths(noise, dt, steps, seeds=256, key=KEY):
     def paths(key):
-        made = jax.vmap(lambda k: noise.realise(noise.draw(k, steps), dt))(jax.random.split(key, seeds))
+        made = jax.vmap(lambda k: noise.realise(noise.draw(k, steps), dt))(
+            jax.random.split(key, seeds)
+        )
         return made.values, made.slopes, made.increments
 
     return Realisation(*at_once(paths, key))
@@ -46,7 +49,9 @@ def band_autocovariance(noise, lag):
 
 @pytest.mark.parametrize("noise, variance", [(BAND, band_variance(BAND)), (OU, 1.0)])
 def test_the_density_integrates_to_the_stationary_variance(x64, noise, variance):
-    half, _ = scipy.integrate.quad(lambda f: float(noise.psd(f)[0]), 0, np.inf, epsabs=1e-12, epsrel=1e-10)
+    half, _ = scipy.integrate.quad(
+        lambda f: float(noise.psd(f)[0]), 0, np.inf, epsabs=1e-12, epsrel=1e-10
+    )
     np.testing.assert_allclose(2 * half, variance, rtol=1e-8)
 
 
@@ -63,32 +68,51 @@ def test_psd_scales_with_the_square_of_the_amplitude():
     f = np.array([0.0, 10.0])
     np.testing.assert_allclose(jm.WhiteNoise(0.3, rate=200.0).psd(f), 0.09 / 200, rtol=1e-6)
     rows = jm.WhiteNoise((0.1, 0.2, 0.0, 1.0), rate=100.0).psd(f)
-    np.testing.assert_allclose(rows, np.square([[0.1] * 2, [0.2] * 2, [0.0] * 2, [1.0] * 2]) / 100, rtol=1e-6)
+    np.testing.assert_allclose(
+        rows, np.square([[0.1] * 2, [0.2] * 2, [0.0] * 2, [1.0] * 2]) / 100, rtol=1e-6
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [WHITE, BAND, OU], ids=["white", "band-limited", "ornstein-uhlenbeck"])
+@pytest.mark.parametrize(
+    "noise", [WHITE, BAND, OU], ids=["white", "band-limited", "ornstein-uhlenbeck"]
+)
 def test_paths_have_the_density(x64, noise):
     dt, steps, chunk = 4e-3, 2048, 256
     paths = unit_paths(noise, dt, steps)
     # White noise is the derivative of its increments' sum: its mean over a step.
-    x = np.asarray(paths.increments) / dt if paths.values is None else np.asarray(paths.values)[:, :steps]
+    x = (
+        np.asarray(paths.increments) / dt
+        if paths.values is None
+        else np.asarray(paths.values)[:, :steps]
+    )
     bins = np.arange(4, 84, 2)  # to 80 Hz of 250 Hz
     segments = x.reshape(256, steps // chunk, chunk, 4)
     taper = np.hanning(chunk + 1)[:-1, None]
     power = np.abs(np.fft.rfft(segments * taper, axis=2)) ** 2 * dt / np.sum(taper**2)
     power = power[:, :, bins].mean(axis=(1, 3))
-    # The density of the *sampled* path is what a periodogram estimates: aliases are part of the reference, and
-    # so is the taper's leakage (no mean was removed).
+    # The density of the *sampled* path is what a periodogram estimates: aliases are part of the
+    # reference, and so is the taper's leakage (no mean was removed).
     frequency = (np.arange(4096) / 4096 - 0.5) / dt
-    sampled = (lambda f: np.full_like(f, 1 / 50.0)) if noise is WHITE else lambda f: np.asarray(noise.density(f))
-    density = sampled(frequency) if noise is WHITE else references.aliased(sampled, 1 / dt, frequency, 200)
+    sampled = (
+        (lambda f: np.full_like(f, 1 / 50.0))
+        if noise is WHITE
+        else lambda f: np.asarray(noise.density(f))
+    )
+    density = (
+        sampled(frequency)
+        if noise is WHITE
+        else references.aliased(sampled, 1 / dt, frequency, 200)
+    )
     m = np.arange(chunk)
     wave = np.exp(2j * np.pi * np.outer(frequency * dt, m)) * taper[:, 0]
-    kernel = np.abs(wave @ np.exp(-2j * np.pi * np.outer(m, bins) / chunk)) ** 2 * dt / np.sum(taper**2)
+    kernel = (
+        np.abs(wave @ np.exp(-2j * np.pi * np.outer(m, bins) / chunk)) ** 2 * dt / np.sum(taper**2)
+    )
     expected = density @ kernel / dt / len(frequency)
     error = power.std(axis=0, ddof=1) / np.sqrt(len(power))
-    references.assert_standard_normal((power.mean(axis=0) - expected) / error)  # bins two apart: independent
+    # bins two apart: independent
+    references.assert_standard_normal((power.mean(axis=0) - expected) / error)
 
 
 def covariances(x, lags):
@@ -105,7 +129,9 @@ def test_the_autocovariance_is_exact_at_any_step(x64, noise, dt):
     lags = np.rint(np.array([0.0, 0.008, 0.016, 0.032, 0.064]) / dt).astype(int)
     seen = covariances(x, lags)
     lag = lags * dt
-    exact = band_autocovariance(noise, lag) if noise is BAND else np.exp(-lag / noise.correlation_time)
+    exact = (
+        band_autocovariance(noise, lag) if noise is BAND else np.exp(-lag / noise.correlation_time)
+    )
     deviation = seen - exact
     standard = deviation.mean(axis=0) / (deviation.std(axis=0, ddof=1) / np.sqrt(len(x)))
     # Lags of one path depend on each other: decorrelate them by their own covariance.
@@ -117,17 +143,24 @@ def test_the_autocovariance_is_exact_at_any_step(x64, noise, dt):
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [BAND, OU], ids=["band-limited", "ornstein-uhlenbeck"])
 def test_the_transition_is_the_exact_one(x64, noise):
-    """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form covariance."""
+    """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form
+    covariance."""
     steps, grids = 5, (8e-3, 2e-3)
 
     def matrices(key):
         normals = noise.draw(key, steps)[:, ::4]  # of the first channel
-        return [jax.jacfwd(lambda z, h=dt: noise.realise(z, h).values[:, 0])(normals) for dt in grids]
+        return [
+            jax.jacfwd(lambda z, h=dt: noise.realise(z, h).values[:, 0])(normals) for dt in grids
+        ]
 
     for dt, found in zip(grids, at_once(matrices, KEY), strict=True):
         matrix = np.asarray(found).reshape(steps + 1, -1)
         lag = dt * np.subtract.outer(np.arange(steps + 1), np.arange(steps + 1))
-        exact = band_autocovariance(noise, lag) if noise is BAND else np.exp(-np.abs(lag) / noise.correlation_time)
+        exact = (
+            band_autocovariance(noise, lag)
+            if noise is BAND
+            else np.exp(-np.abs(lag) / noise.correlation_time)
+        )
         np.testing.assert_allclose(matrix @ matrix.T, exact, rtol=1e-9, atol=1e-12)
 
 
@@ -150,9 +183,11 @@ def test_slopes_are_the_derivative_of_values(x64):
         slopes = np.asarray(path.slopes)
         middle = 0.5 * (slopes[:, 1:] + slopes[:, :-1])
         rms = np.sqrt(np.mean((difference - middle) ** 2) / (omega**2 * band_variance(BAND)))
-        # N' is as rough as Brownian motion of variance q = 2√2 ω var(N') per second: a bridge's mean has q dt / 12.
-        # The next term is of relative order ω dt.
-        np.testing.assert_allclose(rms, np.sqrt(np.sqrt(2) * omega * dt / 6), rtol=0.5 * omega * dt + 0.01)
+        # N' is as rough as Brownian motion of variance q = 2√2 ω var(N') per second: a bridge's
+        # mean has q dt / 12. The next term is of relative order ω dt.
+        np.testing.assert_allclose(
+            rms, np.sqrt(np.sqrt(2) * omega * dt / 6), rtol=0.5 * omega * dt + 0.01
+        )
 
 
 @pytest.mark.slow
@@ -181,7 +216,9 @@ def test_channels_are_independent_unless_shared(x64, kind):
 
     own = path(kind(1.0))
     assert own.shape[-1] == 4
-    products = np.stack([(own[..., i] * own[..., j]).mean(axis=1) for i in range(4) for j in range(i)])
+    products = np.stack(
+        [(own[..., i] * own[..., j]).mean(axis=1) for i in range(4) for j in range(i)]
+    )
     standard = products.mean(axis=1) / (products.std(axis=1, ddof=1) / 8)
     references.assert_standard_normal(standard)
     assert path(kind(1.0, shared=True)).shape[-1] == 1
@@ -193,7 +230,9 @@ def test_a_shared_noise_moves_all_coefficients_together(x64):
         noise = jm.BandLimitedNoise({channel: 0.1}, shared=shared)
         return jm.simulate(jm.Isometric(noise=noise, x_z=0.01), KEY, duration=1.0).output
 
-    quiet = jm.simulate(jm.Isometric(noise=jm.BandLimitedNoise(0.0), x_z=0.01), KEY, duration=1.0).output
+    quiet = jm.simulate(
+        jm.Isometric(noise=jm.BandLimitedNoise(0.0), x_z=0.01), KEY, duration=1.0
+    ).output
     # Nearly linear: what K_w and K_z do with one path adds up to what a shared noise does on both.
     both = jm.BandLimitedNoise({"K_w": 1e-4, "K_z": 1e-4}, shared=True)
     joint = jm.simulate(jm.Isometric(noise=both, x_z=0.01), KEY, duration=1.0).output - quiet
@@ -233,7 +272,9 @@ def test_relative_noise_is_absolute_noise_of_that_size(x64):
 
 @pytest.mark.parametrize("kind", [jm.WhiteNoise, jm.BandLimitedNoise, jm.OrnsteinUhlenbeckNoise])
 def test_impossible_amplitudes_are_refused(kind):
-    with pytest.raises(ValueError, match=r"unknown input \['K_x'\]: known: K_w, K_z, C_w, C_z, P_w"):
+    with pytest.raises(
+        ValueError, match=r"unknown input \['K_x'\]: known: K_w, K_z, C_w, C_z, P_w"
+    ):
         kind({"K_x": 0.1})
     with pytest.raises(ValueError, match="noise amplitude has 3 entries"):
         kind((0.1, 0.2, 0.3))
@@ -255,15 +296,24 @@ def test_impossible_rates_and_grids_are_refused():
         jm.OrnsteinUhlenbeckNoise(correlation_time=0.0)
     with pytest.raises(ValueError, match=r"dt = 0.01 s is too coarse for noise_cutoff = 50.0 Hz"):
         jm.simulate(jm.Isometric(), KEY, dt=0.01)
-    with pytest.raises(ValueError, match=r"dt = 0.01 s is too coarse for noise_correlation_time = 0.01 s"):
-        jm.simulate(jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise(correlation_time=0.01)), KEY, dt=0.01)
+    with pytest.raises(
+        ValueError, match=r"dt = 0.01 s is too coarse for noise_correlation_time = 0.01 s"
+    ):
+        jm.simulate(
+            jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise(correlation_time=0.01)), KEY, dt=0.01
+        )
 
 
 @pytest.mark.slow
 def test_single_precision_paths_follow_double_ones():
-    for kind, attributes in ((jm.BandLimitedNoise, ("values", "slopes")), (jm.OrnsteinUhlenbeckNoise, ("values",)),
-                             (jm.WhiteNoise, ("increments",))):  # fmt: skip
-        normals = np.random.default_rng(0).normal(size=(501, 8 if kind is jm.BandLimitedNoise else 4))
+    for kind, attributes in (
+        (jm.BandLimitedNoise, ("values", "slopes")),
+        (jm.OrnsteinUhlenbeckNoise, ("values",)),
+        (jm.WhiteNoise, ("increments",)),
+    ):
+        normals = np.random.default_rng(0).normal(
+            size=(501, 8 if kind is jm.BandLimitedNoise else 4)
+        )
 
         def paths(dtype, kind=kind, normals=normals, attributes=attributes):
             def made(normals):
@@ -276,12 +326,14 @@ def test_single_precision_paths_follow_double_ones():
             return [np.asarray(path, float) for path in found]
 
         for single, double in zip(paths(np.float32), paths(np.float64), strict=True):
-            # The process noise is a difference of nearly equal numbers, good to a few 1e-4 in single precision.
+            # The process noise is a difference of nearly equal numbers, good to a few 1e-4 in
+            # single precision.
             np.testing.assert_allclose(single, double, atol=1e-3 * double.std())
 
 
 class Smooth(jm.model.AbstractNoise):
-    """Autocovariance `(1 + λ|t|) exp(-λ|t|)`, λ = 2π corner: white noise through the same low-pass twice."""
+    """Autocovariance `(1 + λ|t|) exp(-λ|t|)`, λ = 2π corner: white noise through the same low-pass
+    twice."""
 
     amplitude: Scalar = eqx.field(converter=jm.model.as_amplitude, default=None)
     corner: Scalar = 1.0
@@ -303,7 +355,9 @@ class Smooth(jm.model.AbstractNoise):
         x = 2 * jnp.pi * self.corner * dt
         A = jnp.exp(-x) * jnp.array([[1 + x, x], [-x, 1 - x]])
         a, b = gammainc(3.0, 2 * x), 2 * x**2 * jnp.exp(-2 * x)
-        return self.made(A, jnp.linalg.cholesky(jnp.array([[a, b], [b, a + 4 * x * jnp.exp(-2 * x)]])))
+        return self.made(
+            A, jnp.linalg.cholesky(jnp.array([[a, b], [b, a + 4 * x * jnp.exp(-2 * x)]]))
+        )
 
     def made(self, A, L):
         H, S = (1.0, 0.0), (0.0, 2 * jnp.pi * self.corner)
@@ -314,15 +368,47 @@ class Smooth(jm.model.AbstractNoise):
 
 
 WRONG_NOISES = {
-    "density": ("density", lambda self, f: jnp.exp(-f), r"density at 0\.3 Hz is 0\.53\d+ by .*, but 0\.74082 by"),
-    "step": ("made", lambda self, A, L: Smooth.made(self, A, 1.1 * L), r"variance of state 1 after a step is 1\.00\d* by"),
-    "correlation": ("made", lambda self, A, L: Smooth.made(self, *faster(A)), r"correlation after .* s is .* by recursion"),
-    "no slope": ("made", lambda self, A, L: without_slope(Smooth.made(self, A, L)), r"smoothness = 2, so rec.* must give S"),
-    "slope": ("made", lambda self, A, L: with_slope(Smooth.made(self, A, L)), "variance of the slope is 1 by recursion"),
-    "digits": ("made", lambda self, A, L: Smooth.made(self, A, rest(A)), r"0 has the variance 3\.276e-07 in double.*single"),
-    "kind": ("shaping_filter", lambda self: jnp.zeros(2), "returns a ArrayImpl; it must return a ShapingFilter"),
-    "error": ("recursion", lambda self, dt: self.nothing, r"recursion\(0\.001\) cannot be computed: Attr.*nothing"),
-}  # fmt: skip
+    "density": (
+        "density",
+        lambda self, f: jnp.exp(-f),
+        r"density at 0\.3 Hz is 0\.53\d+ by .*, but 0\.74082 by",
+    ),
+    "step": (
+        "made",
+        lambda self, A, L: Smooth.made(self, A, 1.1 * L),
+        r"variance of state 1 after a step is 1\.00\d* by",
+    ),
+    "correlation": (
+        "made",
+        lambda self, A, L: Smooth.made(self, *faster(A)),
+        r"correlation after .* s is .* by recursion",
+    ),
+    "no slope": (
+        "made",
+        lambda self, A, L: without_slope(Smooth.made(self, A, L)),
+        r"smoothness = 2, so rec.* must give S",
+    ),
+    "slope": (
+        "made",
+        lambda self, A, L: with_slope(Smooth.made(self, A, L)),
+        "variance of the slope is 1 by recursion",
+    ),
+    "digits": (
+        "made",
+        lambda self, A, L: Smooth.made(self, A, rest(A)),
+        r"0 has the variance 3\.276e-07 in double.*single",
+    ),
+    "kind": (
+        "shaping_filter",
+        lambda self: jnp.zeros(2),
+        "returns a ArrayImpl; it must return a ShapingFilter",
+    ),
+    "error": (
+        "recursion",
+        lambda self, dt: self.nothing,
+        r"recursion\(0\.001\) cannot be computed: Attr.*nothing",
+    ),
+}
 
 
 def faster(A):
@@ -353,32 +439,50 @@ def test_a_noise_of_ones_own_is_looked_at(case):
 
 
 @pytest.mark.parametrize(
-    "noise", [WHITE, BAND, OU, jm.PinkNoise(1.0), jm.ResonantNoise(1.0, 9.0, 2.0)], ids=lambda n: type(n).__name__
+    "noise",
+    [WHITE, BAND, OU, jm.PinkNoise(1.0), jm.ResonantNoise(1.0, 9.0, 2.0)],
+    ids=lambda n: type(n).__name__,
 )
 def test_what_is_asked_of_a_noise_of_ones_own_holds_of_ours(noise, monkeypatch):
     monkeypatch.setattr(_own_parts, "_ours", lambda part: False)
     monkeypatch.setattr(_own_parts, "_SEEN", set())
-    kind = type(noise)  # its recursion compiled as a whole; those of own classes, above, run as they are
-    monkeypatch.setattr(kind, "recursion", lambda self, dt, made=kind.recursion: eqx.filter_jit(made)(self, dt))
+    # its recursion compiled as a whole; those of own classes, above, run as they are
+    kind = type(noise)
+    monkeypatch.setattr(
+        kind, "recursion", lambda self, dt, made=kind.recursion: eqx.filter_jit(made)(self, dt)
+    )
     _own_parts.check_noise(noise)
     assert type(noise) in _own_parts._SEEN
 
 
 @pytest.mark.slow
 def test_a_noise_of_ones_own_is_simulated_as_its_response_says():
-    """16 seeds with the control variate: the standard error is a few tenths of a per cent, what the response misses less."""
+    """16 seeds with the control variate: the standard error is a few tenths of a per cent, what the
+    response misses less."""
     runs = jm.ensemble(jm.Isometric(noise=Smooth({"K_w": 0.02})), KEY, seeds=16)
     estimate = runs.mean_spectrum()
     error = np.asarray(estimate.stderr / estimate.expected)
-    assert np.max(np.abs(estimate.nonlinearity) / error) < 6 and np.max(np.abs(estimate.nonlinearity)) < 0.02
+    assert (
+        np.max(np.abs(estimate.nonlinearity) / error) < 6
+        and np.max(np.abs(estimate.nonlinearity)) < 0.02
+    )
     raw, rough = np.asarray(runs.spectrum().power).mean(0), 4 / np.sqrt(16 * 5)
     assert np.all(np.abs(raw / np.asarray(estimate.expected) - 1) < 1.2 * rough)
 
 
 def test_a_noise_prints_its_numbers():
-    assert repr(BAND) == "BandLimitedNoise(amplitude=1.0, rate=50.0, cutoff=12.0, relative=True, shared=False)"
+    assert (
+        repr(BAND)
+        == "BandLimitedNoise(amplitude=1.0, rate=50.0, cutoff=12.0, relative=True, shared=False)"
+    )
     both = repr(jm.BandLimitedNoise({"K_w": 0.1}) + jm.ResonantNoise(0.2, 9.0, 2.0))
-    assert "amplitude=[0.1, 0.0, 0.0, 0.0]" in both and "ResonantNoise(amplitude=[0.2], frequency=9.0" in both
+    assert (
+        "amplitude=[0.1, 0.0, 0.0, 0.0]" in both
+        and "ResonantNoise(amplitude=[0.2], frequency=9.0" in both
+    )
     traced = []
     jax.jit(lambda a: traced.append(repr(jm.BandLimitedNoise(a))) or a)(1.0)
-    assert traced[0].startswith("BandLimitedNoise(amplitude=") and "0." not in traced[0].partition(",")[0]
+    assert (
+        traced[0].startswith("BandLimitedNoise(amplitude=")
+        and "0." not in traced[0].partition(",")[0]
+    )

@@ -1,4 +1,5 @@
-"""A task taken apart into arrays by name and put together again: what `jax.grad` and optimisers work on."""
+"""A task taken apart into arrays by name and put together again: what `jax.grad` and optimisers
+work on."""
 
 import functools
 
@@ -30,7 +31,9 @@ def by_name():
 
 
 @pytest.mark.parametrize(
-    "task", [jm.Isometric(), jm.PrescribedForce(), jm.PrescribedMotion()], ids=lambda t: type(t).__name__
+    "task",
+    [jm.Isometric(), jm.PrescribedForce(), jm.PrescribedMotion()],
+    ids=lambda t: type(t).__name__,
 )
 def test_values_are_arrays_by_name_and_rebuild_the_task(x64, task):
     values, rebuild = jm.model.partition(task, task.parameter_names)
@@ -38,8 +41,12 @@ def test_values_are_arrays_by_name_and_rebuild_the_task(x64, task):
     assert all(isinstance(value, jax.Array) and value.shape == () for value in values.values())
     again = rebuild(values)
     assert type(again) is type(task)
-    assert {name: float(value) for name, value in again.parameters.items()} == {n: float(task[n]) for n in values}
-    assert float(rebuild({"k_w": 4e5})["k_w"]) == 4e5 and rebuild({"k_w": 4e5})["c_w"] == task["c_w"]
+    assert {name: float(value) for name, value in again.parameters.items()} == {
+        n: float(task[n]) for n in values
+    }
+    assert (
+        float(rebuild({"k_w": 4e5})["k_w"]) == 4e5 and rebuild({"k_w": 4e5})["c_w"] == task["c_w"]
+    )
 
 
 def test_precision_is_the_callers():
@@ -60,14 +67,17 @@ def test_slopes_by_name_against_differences_and_against_replace(x64):
     np.testing.assert_allclose([slopes[name] for name in NAMES], together, rtol=1e-9)
     for name in NAMES:
         h = STEP * float(values[name])
-        ahead, behind = (float(loss(rebuild(values | {name: values[name] + s * h}))) for s in (1, -1))
+        ahead, behind = (
+            float(loss(rebuild(values | {name: values[name] + s * h}))) for s in (1, -1)
+        )
         assert float(slopes[name]) != 0
         np.testing.assert_allclose(slopes[name], (ahead - behind) / (2 * h), rtol=SLOPE)
 
 
 @pytest.mark.slow
 def test_what_filter_grad_says_of_numbers_and_of_arrays(x64):
-    """The reason for `partition`: None for a Python number, and the slope where all numbers have become arrays."""
+    """The reason for `partition`: None for a Python number, and the slope where all numbers have
+    become arrays."""
     assert eqx.filter_grad(loss)(TASK).muscle.stiffness_w.k is None
 
     def three(task):
@@ -75,12 +85,15 @@ def test_what_filter_grad_says_of_numbers_and_of_arrays(x64):
         return whole.muscle.stiffness_w.k, whole.noise.amplitude[0], whole.P_w.level
 
     found, (_, _, slopes) = at_once(three, jax.tree.map(jnp.asarray, TASK)), by_name()
-    np.testing.assert_allclose(found, [slopes[name] for name in ("k_w", "noise_K_w", "P_w")], rtol=1e-9)
+    np.testing.assert_allclose(
+        found, [slopes[name] for name in ("k_w", "noise_K_w", "P_w")], rtol=1e-9
+    )
 
 
 @pytest.mark.slow
 def test_a_gradient_step_by_an_optimiser_of_pytrees(x64):
-    """`optax` moves such dictionaries: ten steps of plain descent in the logarithm lower the loss at every step."""
+    """`optax` moves such dictionaries: ten steps of plain descent in the logarithm lower the loss
+    at every step."""
     optax = pytest.importorskip("optax")
     target = jnp.log(jm.expected_spectrum(TASK.replace(k_w=4e5, c_w=80.0)).proportional)
     values, rebuild = jm.model.partition(TASK, ("k_w", "c_w"))
@@ -114,7 +127,9 @@ def test_a_rebuilt_task_is_simulated_and_saved(x64, tmp_path):
 def test_wrong_names_and_values_are_refused():
     with pytest.raises(ValueError, match="unknown parameter 'k'"):
         jm.model.partition(TASK, ("k",))
-    with pytest.raises(ValueError, match=r"names = 'k_w' is one text: give a list of names, \['k_w'\]"):
+    with pytest.raises(
+        ValueError, match=r"names = 'k_w' is one text: give a list of names, \['k_w'\]"
+    ):
         jm.model.partition(TASK, "k_w")
     _, rebuild = jm.model.partition(TASK, ("k_w",))
     with pytest.raises(ValueError, match=r"k_w = -1.0 N/m\^3 is outside"):

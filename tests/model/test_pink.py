@@ -1,4 +1,5 @@
-"""Pink noise: how close to 1/f it is, its exact paths, filter and linear response, and where it may be used."""
+"""Pink noise: how close to 1/f it is, its exact paths, filter and linear response, and where it may
+be used."""
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +49,8 @@ def test_the_density_is_near_one_over_f_with_the_fewest_states(band):
     assert largest <= _pink.TOLERANCE
     # A mean over at least 2000 points counts the ends of the band whole instead of half.
     np.testing.assert_allclose(noise.deviation(), largest, rtol=1e-3)
-    # A best approximation alternates: 2 n + 1 equally large extremes, one more than it has free numbers (Chebyshev).
+    # A best approximation alternates: 2 n + 1 equally large extremes, one more than it has free
+    # numbers (Chebyshev).
     for count in {noise.corners.size, max(noise.corners.size - 1, 1)}:
         corners, shares = _pink._zolotarev(*band, count)
         assert np.all(np.diff(corners) > 0) and np.all(shares > 0)
@@ -71,26 +73,33 @@ def test_the_default_band_takes_four_states_within_3_6_percent(x64):
     assert noise.deviation() <= 0.036 and np.abs(log_level - log_level.mean()).max() <= 0.036
     assert log_level.std() <= 0.025
     inside = 2 * np.trapezoid(level(noise), np.linspace(np.log(0.05), np.log(50.0), 40_001))
-    np.testing.assert_allclose([np.exp(log_level.mean()), inside], [0.053, 0.73], rtol=0.01)  # as docs/model.md rounds them
+    # as docs/model.md rounds them
+    np.testing.assert_allclose([np.exp(log_level.mean()), inside], [0.053, 0.73], rtol=0.01)
 
 
 def test_the_density_is_the_transform_of_the_autocovariance(x64):
     noise = jm.PinkNoise(1.0, 0.5, 50.0)
     np.testing.assert_allclose(noise.shares.sum(), 1.0, rtol=1e-14)
-    half, _ = scipy.integrate.quad(lambda x: np.exp(x) * float(noise.psd(np.exp(x))[0]), -30, 30, limit=200, epsrel=1e-10)
+    half, _ = scipy.integrate.quad(
+        lambda x: np.exp(x) * float(noise.psd(np.exp(x))[0]), -30, 30, limit=200, epsrel=1e-10
+    )
     np.testing.assert_allclose(2 * half, 1.0, rtol=1e-8)
-    lag = np.linspace(0, 10.0, 200_001)  # to e^-34 of the slowest; Simpson's (ω h)⁴ / 180 is 2e-10 at the fastest corner
+    # to e^-34 of the slowest; Simpson's (ω h)⁴ / 180 is 2e-10 at the fastest corner
+    lag = np.linspace(0, 10.0, 200_001)
     r = autocovariance(noise, lag)
     for f in (0.0, 0.5, 3.0, 12.0, 30.0):
         transform = 2 * scipy.integrate.simpson(r * np.cos(2 * np.pi * f * lag), x=lag)
         np.testing.assert_allclose(noise.psd(f)[0], transform, rtol=1e-7)
-    np.testing.assert_allclose(jm.PinkNoise(0.3).psd(2.0), 0.09 * jm.PinkNoise(1.0).psd(2.0), rtol=1e-12)
+    np.testing.assert_allclose(
+        jm.PinkNoise(0.3).psd(2.0), 0.09 * jm.PinkNoise(1.0).psd(2.0), rtol=1e-12
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dt", [5e-3, 2.5e-3])
 def test_the_transition_is_the_exact_one(x64, dt):
-    """The map from normals to the path, taken as a matrix: its Gram matrix is the autocovariance at any step."""
+    """The map from normals to the path, taken as a matrix: its Gram matrix is the autocovariance at
+    any step."""
     steps = 6
 
     def drawn(key):
@@ -122,19 +131,23 @@ def test_drawn_paths_have_the_autocovariance(x64, dt):
 
 @pytest.mark.slow
 def test_paths_have_the_density(x64):
-    """Periodograms of drawn paths; a tapered segment's expected power is a quadratic form of the autocovariance."""
+    """Periodograms of drawn paths; a tapered segment's expected power is a quadratic form of the
+    autocovariance."""
     dt, steps, chunk, seeds = 4e-3, 2048, 256, 256
     x = unit_paths(PINK, dt, steps, seeds)[:, :steps].reshape(seeds, steps // chunk, chunk, 4)
     bins = np.arange(3, 84, 3)  # 3 Hz to 80 Hz of 250 Hz, far enough apart to be independent
     taper = scipy.signal.get_window("hann", chunk)
     scale = dt / np.sum(taper**2)
-    power = (np.abs(np.fft.rfft(x * taper[:, None], axis=2)) ** 2 * scale)[:, :, bins].mean(axis=(1, 3))
+    power = (np.abs(np.fft.rfft(x * taper[:, None], axis=2)) ** 2 * scale)[:, :, bins].mean(
+        axis=(1, 3)
+    )
     rows = taper * np.exp(-2j * np.pi * np.outer(bins, np.arange(chunk)) / chunk)
     covariance = scipy.linalg.toeplitz(autocovariance(PINK, dt * np.arange(chunk)))
     expected = np.einsum("km,mn,kn->k", rows, covariance, rows.conj()).real * scale
     error = power.std(axis=0, ddof=1) / np.sqrt(seeds)
     references.assert_standard_normal((power.mean(axis=0) - expected) / error)
-    # The density itself, where neither aliases nor leakage reach: 1/f from 3 to 12 Hz, to the deviation and 3 Hz's leakage.
+    # The density itself, where neither aliases nor leakage reach: 1/f from 3 to 12 Hz, to the
+    # deviation and 3 Hz's leakage.
     seen = np.log(power.mean(axis=0)[:4] * bins[:4])
     assert np.ptp(seen) < 2 * PINK.deviation() + 3.3 * np.sqrt(2) * np.max(error / expected) + 0.05
 
@@ -143,11 +156,19 @@ def test_paths_have_the_density(x64):
 def test_channels_are_independent_unless_shared(x64):
     x = unit_paths(PINK, 2e-3, 400, seeds=128)
     products = np.stack([(x[..., i] * x[..., j]).mean(axis=1) for i in range(4) for j in range(i)])
-    references.assert_standard_normal(products.mean(axis=1) / (products.std(axis=1, ddof=1) / np.sqrt(128)))
+    references.assert_standard_normal(
+        products.mean(axis=1) / (products.std(axis=1, ddof=1) / np.sqrt(128))
+    )
     assert unit_paths(jm.PinkNoise(1.0, shared=True), 2e-3, 10, seeds=2).shape == (2, 11, 1)
 
 
-FILTERED = [jm.WhiteNoise(1.0), jm.BandLimitedNoise(1.0), jm.OrnsteinUhlenbeckNoise(1.0), PINK, jm.PinkNoise(1.0, 1.0, 2.0)]
+FILTERED = [
+    jm.WhiteNoise(1.0),
+    jm.BandLimitedNoise(1.0),
+    jm.OrnsteinUhlenbeckNoise(1.0),
+    PINK,
+    jm.PinkNoise(1.0, 1.0, 2.0),
+]
 
 
 @pytest.mark.parametrize("noise", FILTERED, ids=lambda noise: type(noise).__name__)
@@ -162,29 +183,42 @@ def test_the_shaping_filter_has_the_density(x64, noise):
 
 TASKS = {
     "isometric": jm.Isometric(5.0, 0.003, noise=jm.PinkNoise(0.1)),
-    "force, shared": jm.PrescribedForce(5.0, 1.0, noise=jm.PinkNoise({"K_w": 0.1, "K_z": 0.05}, shared=True)),
-    "motion": jm.PrescribedMotion(0.004, 6.0, noise=jm.PinkNoise({"K_w": 0.1, "C_w": 0.1}, 0.2, 40.0)),
+    "force, shared": jm.PrescribedForce(
+        5.0, 1.0, noise=jm.PinkNoise({"K_w": 0.1, "K_z": 0.05}, shared=True)
+    ),
+    "motion": jm.PrescribedMotion(
+        0.004, 6.0, noise=jm.PinkNoise({"K_w": 0.1, "C_w": 0.1}, 0.2, 40.0)
+    ),
 }
 
 
-@pytest.mark.parametrize("name", ["isometric", *(pytest.param(n, marks=pytest.mark.slow) for n in list(TASKS)[1:])])
+@pytest.mark.parametrize(
+    "name", ["isometric", *(pytest.param(n, marks=pytest.mark.slow) for n in list(TASKS)[1:])]
+)
 @pytest.mark.slow
 def test_its_response_is_the_sum_of_its_states_responses(x64, name):
-    """Each is an Ornstein-Uhlenbeck noise of variance w_i and correlation time 1 / 2π f_i, with a known response."""
+    """Each is an Ornstein-Uhlenbeck noise of variance w_i and correlation time 1 / 2π f_i, with a
+    known response."""
     task = references.quiet(TASKS[name], harmonic_amplitude=0.0)
     amplitude, noise = TASKS[name].noise.amplitude, TASKS[name].noise
     task, total = task.with_parts(noise=noise), 0.0
     for corner, share in zip(noise.corners, noise.shares, strict=True):
-        one = jm.OrnsteinUhlenbeckNoise(np.sqrt(share) * amplitude, 1 / (2 * np.pi * corner), shared=noise.shared)
+        one = jm.OrnsteinUhlenbeckNoise(
+            np.sqrt(share) * amplitude, 1 / (2 * np.pi * corner), shared=noise.shared
+        )
         total += np.asarray(linear_spectrum(task.with_parts(noise=one), task.settings).power)
     np.testing.assert_allclose(linear_spectrum(task, task.settings).power, total, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_simulations_have_the_expected_spectrum(x64):
-    """Stiffness noise of 1 %: nonlinearity adds 1e-4 of a bin, a seed scatters by more than half of one."""
-    task, window = jm.settled(jm.Isometric(5.0, 0.003, noise=jm.PinkNoise(0.01))), (1.0, 6.12)  # forgets its start by 1 s
-    runs = jm.ensemble(task, KEY, seeds=256, duration=window[1], dt=1.25e-3, substeps=1, control=False)
+    """Stiffness noise of 1 %: nonlinearity adds 1e-4 of a bin, a seed scatters by more than half of
+    one."""
+    # forgets its start by 1 s
+    task, window = jm.settled(jm.Isometric(5.0, 0.003, noise=jm.PinkNoise(0.01))), (1.0, 6.12)
+    runs = jm.ensemble(
+        task, KEY, seeds=256, duration=window[1], dt=1.25e-3, substeps=1, control=False
+    )
     power = np.asarray(runs.spectrum(window=window).power)
     expected = np.asarray(linear_spectrum(task, task.settings, window).power)
     z = (power.mean(axis=0) - expected) / (power.std(axis=0, ddof=1) / np.sqrt(len(power)))
@@ -212,14 +246,20 @@ def test_derivatives_with_respect_to_the_amplitude(x64):
     forward = at_once(jax.jacfwd(log_power), at)
     np.testing.assert_allclose(forward, 2 / 0.1, rtol=1e-9)  # power goes with its square
     reverse = at_once(jax.grad(lambda K_w: weight @ log_power(K_w)), at)
-    np.testing.assert_allclose(reverse, 2 / 0.1 * weight.sum(), rtol=1e-9 * np.abs(weight).sum() / abs(weight.sum()))
+    np.testing.assert_allclose(
+        reverse, 2 / 0.1 * weight.sum(), rtol=1e-9 * np.abs(weight).sum() / abs(weight.sum())
+    )
 
     def last(K_w):
-        return jm.simulate(quiet.replace(noise_K_w=K_w), KEY, duration=0.5, dt=5e-3, substeps=2).output[-1]
+        return jm.simulate(
+            quiet.replace(noise_K_w=K_w), KEY, duration=0.5, dt=5e-3, substeps=2
+        ).output[-1]
 
     h = 1e-5
-    (_, ahead, behind), (forward, *_) = at_once(jax.vmap(lambda K_w: jax.jvp(last, (K_w,), (jnp.ones_like(K_w),))),
-                                                at + h * np.array([0.0, 1.0, -1.0]))  # fmt: skip
+    (_, ahead, behind), (forward, *_) = at_once(
+        jax.vmap(lambda K_w: jax.jvp(last, (K_w,), (jnp.ones_like(K_w),))),
+        at + h * np.array([0.0, 1.0, -1.0]),
+    )
     difference, reverse = (ahead - behind) / (2 * h), at_once(jax.grad(last), at)
     np.testing.assert_allclose([forward, reverse], difference, rtol=1e-6)
     assert abs(difference) > 1e-6
@@ -236,14 +276,19 @@ def test_single_precision():
     task = jm.Isometric(5.0, 0.003, noise=jm.PinkNoise())
 
     def both():
-        values = at_once(lambda z: noise.realise(z, 1e-3).values, normals.astype(jnp.result_type(float)))
+        values = at_once(
+            lambda z: noise.realise(z, 1e-3).values, normals.astype(jnp.result_type(float))
+        )
         return np.asarray(values), np.asarray(jm.expected_spectrum(task).power)
 
     path, power = both()
     assert path.dtype == power.dtype == np.float32
     with jax.enable_x64(True):
         exact_path, exact_power = both()
-        A, F = map(np.asarray, at_once(lambda task: (linearise(task).A, noise.shaping_filter().F), as_arrays(task)))
+        A, F = map(
+            np.asarray,
+            at_once(lambda task: (linearise(task).A, noise.shaping_filter().F), as_arrays(task)),
+        )
     # Each of 500 steps rounds a state by 6e-8; they are forgotten or add up at random.
     np.testing.assert_allclose(path, exact_path, atol=500 * 6e-8)
     # Rounding, of sums over hundreds of lags and of the covariance equations.
@@ -253,22 +298,42 @@ def test_single_precision():
 
 def test_where_it_may_be_used():
     for channel in ("K_z", "C_z"):
-        with pytest.raises(ValueError, match=f"PinkNoise on {channel} cannot be used in PrescribedMotion.*differentiable"):
+        with pytest.raises(
+            ValueError,
+            match=f"PinkNoise on {channel} cannot be used in PrescribedMotion.*differentiable",
+        ):
             jm.PrescribedMotion(noise=jm.PinkNoise({channel: 0.1}))
     assert jm.PrescribedMotion(noise=jm.PinkNoise({"K_w": 0.1, "C_w": 0.1})).noise.smoothness == 1
     assert jm.Isometric(noise=jm.PinkNoise(0.1))["noise_C_z"] == 0.1
-    assert not {"noise_f_low", "noise_f_high"} & set(jm.Isometric(noise=jm.PinkNoise()).parameter_names)
+    assert not {"noise_f_low", "noise_f_high"} & set(
+        jm.Isometric(noise=jm.PinkNoise()).parameter_names
+    )
     assert {name.value for name in NoiseName} == set(NOISES) and NOISES["pink"] is jm.PinkNoise
 
 
 def test_impossible_bands_amplitudes_and_grids_are_refused():
-    for band in ((0.0, 50.0), (-1.0, 50.0), (1.0, 1.9), (50.0, 0.05), (np.nan, 50.0), (0.05, np.inf)):
-        with pytest.raises(ValueError, match=r"f_low = .* Hz, f_high = .* Hz: needs 0 < 2 f_low <= f_high"):
+    for band in (
+        (0.0, 50.0),
+        (-1.0, 50.0),
+        (1.0, 1.9),
+        (50.0, 0.05),
+        (np.nan, 50.0),
+        (0.05, np.inf),
+    ):
+        with pytest.raises(
+            ValueError, match=r"f_low = .* Hz, f_high = .* Hz: needs 0 < 2 f_low <= f_high"
+        ):
             jm.PinkNoise(0.1, *band)
-    for amplitude, message in ((-0.1, "must not be negative"), ({"K_x": 1.0}, "unknown"), ((1.0, 2.0), "has 2 entries")):
+    for amplitude, message in (
+        (-0.1, "must not be negative"),
+        ({"K_x": 1.0}, "unknown"),
+        ((1.0, 2.0), "has 2 entries"),
+    ):
         with pytest.raises(ValueError, match=message):
             jm.PinkNoise(amplitude)
-    with pytest.raises(ValueError, match=r"dt = 0\.01 s is too coarse for pink noise up to f_high = 50\.0 Hz"):
+    with pytest.raises(
+        ValueError, match=r"dt = 0\.01 s is too coarse for pink noise up to f_high = 50\.0 Hz"
+    ):
         jm.simulate(jm.Isometric(noise=jm.PinkNoise()), KEY, dt=0.01)
     for dt in (1e-3, 2.5e-3):
         jm.PinkNoise().check_step(dt)
@@ -280,7 +345,12 @@ def test_preset_round_trip(tmp_path, relative, shared):
     jm.save_preset(tmp_path / "pink.toml", jm.Isometric(noise=noise))
     loaded = jm.load_preset(tmp_path / "pink.toml").noise
     assert isinstance(loaded, jm.PinkNoise)
-    assert (loaded.f_low, loaded.f_high, loaded.relative, loaded.shared) == (0.2, 20.0, relative, shared)
+    assert (loaded.f_low, loaded.f_high, loaded.relative, loaded.shared) == (
+        0.2,
+        20.0,
+        relative,
+        shared,
+    )
     np.testing.assert_array_equal(loaded.amplitude, noise.amplitude)
     text = (tmp_path / "pink.toml").read_text()
     for wrong in ('"low"', "60.0", "[1.0, 2.0]", "true"):
@@ -295,7 +365,8 @@ def test_a_measured_spectrum_is_fitted(tmp_path):
     with without_intervals():
         result = jm.fit(jm.task_for(target, noise="pink"), target, starts=8, seeds=0, check_seeds=0)
     assert result.success, result.message
-    # Residuals in standard deviations of the target: a χ² of as many bins, which few free numbers only lower.
+    # Residuals in standard deviations of the target: a χ² of as many bins, which few free numbers
+    # only lower.
     assert result.chi2_per_bin < scipy.stats.chi2.isf(0.01, len(target.bins)) / len(target.bins)
     result.save(tmp_path / "fit.json")
     kept = jm.load_result(tmp_path / "fit.json").task.noise

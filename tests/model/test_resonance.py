@@ -1,4 +1,5 @@
-"""Resonant noise against its closed forms: density, autocovariance, exact steps; its paths in both precisions; sums."""
+"""Resonant noise against its closed forms: density, autocovariance, exact steps; its paths in both
+precisions; sums."""
 
 import itertools
 
@@ -25,14 +26,20 @@ def density(f, frequency, width):
 
 def autocovariance(lag, frequency, width):
     """Of the velocity of a damped oscillator, roots -πb ± iω."""
-    rate, omega, lag = np.pi * width, 2 * np.pi * np.sqrt(complex(frequency**2 - width**2 / 4)), np.abs(lag)
+    rate, omega, lag = (
+        np.pi * width,
+        2 * np.pi * np.sqrt(complex(frequency**2 - width**2 / 4)),
+        np.abs(lag),
+    )
     return (np.exp(-rate * lag) * (np.cos(omega * lag) - rate / omega * np.sin(omega * lag))).real
 
 
 def equation(frequency, width):
     """`q' = ω N`, `N' = -ω q - 2πb N + √(4πb) w`."""
     omega = 2 * np.pi * frequency
-    return np.array([[0.0, omega], [-omega, -2 * np.pi * width]]), np.array([[0.0], [np.sqrt(4 * np.pi * width)]])
+    return np.array([[0.0, omega], [-omega, -2 * np.pi * width]]), np.array(
+        [[0.0], [np.sqrt(4 * np.pi * width)]]
+    )
 
 
 @pytest.mark.slow
@@ -43,33 +50,51 @@ def test_density_and_filter_are_those_of_the_equation(x64, case):
     np.testing.assert_allclose(noise.psd(f), 0.09 * density(f, frequency, width), rtol=1e-12)
     halves = np.sqrt(frequency**2 + width**2 / 4) + np.array([-0.5, 0.5]) * width
     np.testing.assert_allclose(noise.density(halves), 0.5 * noise.density(frequency), rtol=1e-9)
-    edges = [0.0, *np.clip(frequency + width * np.array([-20, -2, 0, 2, 20]), 0.0, None), 500.0, np.inf]
+    edges = [
+        0.0,
+        *np.clip(frequency + width * np.array([-20, -2, 0, 2, 20]), 0.0, None),
+        500.0,
+        np.inf,
+    ]
     parts = [
-        scipy.integrate.quad(lambda f: float(noise.density(f)), *pair, epsrel=1e-11) for pair in itertools.pairwise(edges)
+        scipy.integrate.quad(lambda f: float(noise.density(f)), *pair, epsrel=1e-11)
+        for pair in itertools.pairwise(edges)
     ]
     assert 2 * sum(part for part, _ in parts) == pytest.approx(1.0, rel=1e-9)
     made = jax.tree.map(np.asarray, noise.shaping_filter())
-    reply = [made.H @ np.linalg.solve(2j * np.pi * x * np.eye(2) - made.F, made.G) + made.L for x in f]
-    np.testing.assert_allclose(np.abs(np.array(reply)[:, 0]) ** 2, density(f, frequency, width), rtol=1e-9, atol=1e-30)
+    reply = [
+        made.H @ np.linalg.solve(2j * np.pi * x * np.eye(2) - made.F, made.G) + made.L for x in f
+    ]
+    np.testing.assert_allclose(
+        np.abs(np.array(reply)[:, 0]) ** 2, density(f, frequency, width), rtol=1e-9, atol=1e-30
+    )
     slowest = -np.linalg.eigvals(equation(frequency, width)[0]).real.max()
     lag = np.linspace(0, 30 / slowest, 2_000_001)
     for x in (0.0, 0.5 * frequency, 2.5 * frequency):
-        transform = 2 * scipy.integrate.simpson(autocovariance(lag, frequency, width) * np.cos(2 * np.pi * x * lag), x=lag)
-        np.testing.assert_allclose(noise.density(x), transform, rtol=1e-5, atol=1e-9)  # 30 e-folds; Simpson's (ω h)⁴
+        transform = 2 * scipy.integrate.simpson(
+            autocovariance(lag, frequency, width) * np.cos(2 * np.pi * x * lag), x=lag
+        )
+        # 30 e-folds; Simpson's (ω h)⁴
+        np.testing.assert_allclose(noise.density(x), transform, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("case", CASES)
 def test_a_step_is_the_exact_one(case, precision):
-    """Transition by scipy's expm, what is added by Van Loan's, and the stationary covariance of both, which is 1."""
+    """Transition by scipy's expm, what is added by Van Loan's, and the stationary covariance of
+    both, which is 1."""
     F, G = equation(*CASES[case])
     decay = np.linalg.eigvals(F).real.max()
-    rounding = 8 * np.finfo(precision).eps  # of an exponential, and of sums of eight kicks relative to their own size
+    # of an exponential, and of sums of eight kicks relative to their own size
+    rounding = 8 * np.finfo(precision).eps
     grids = (1e-3, 1e-2)
     with jax.enable_x64(precision == "float64"):
         made = at_once(
-            lambda *numbers: [exact_step(jm.ResonantNoise(1.0, *numbers).shaping_filter(), dt) for dt in grids], *CASES[case]
+            lambda *numbers: [
+                exact_step(jm.ResonantNoise(1.0, *numbers).shaping_filter(), dt) for dt in grids
+            ],
+            *CASES[case],
         )
     for dt, (step, kick) in zip(grids, made, strict=True):
         assert step.dtype == kick.dtype == precision
@@ -80,27 +105,36 @@ def test_a_step_is_the_exact_one(case, precision):
         scale = np.sqrt(np.diag(added))
         np.testing.assert_allclose(step, exact, rtol=0, atol=rounding)
         relative = np.outer(scale, scale)
-        np.testing.assert_allclose(kick @ kick.T / relative, added / relative, rtol=0, atol=rounding)
+        np.testing.assert_allclose(
+            kick @ kick.T / relative, added / relative, rtol=0, atol=rounding
+        )
         assert kick[0, 1] == 0
         stationary = scipy.linalg.solve_discrete_lyapunov(step, kick @ kick.T)
-        np.testing.assert_allclose(stationary, np.eye(2), rtol=0, atol=rounding / -np.expm1(2 * decay * dt))
+        np.testing.assert_allclose(
+            stationary, np.eye(2), rtol=0, atol=rounding / -np.expm1(2 * decay * dt)
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_path_is_exact_on_the_grid(x64, case):
-    """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form covariance."""
+    """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form
+    covariance."""
     noise, steps = jm.ResonantNoise(1.0, *CASES[case]), 6
     grids = (8e-3, 1e-3)
 
     def matrices(key):
         normals = noise.draw(key, steps)
-        return [jax.jacfwd(lambda z, h=dt: noise.realise(z, h).values[:, 0])(normals) for dt in grids]
+        return [
+            jax.jacfwd(lambda z, h=dt: noise.realise(z, h).values[:, 0])(normals) for dt in grids
+        ]
 
     for dt, found in zip(grids, at_once(matrices, KEY), strict=True):
         matrix = np.asarray(found).reshape(steps + 1, -1)
         lag = dt * np.subtract.outer(np.arange(steps + 1), np.arange(steps + 1))
-        np.testing.assert_allclose(matrix @ matrix.T, autocovariance(lag, *CASES[case]), rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(
+            matrix @ matrix.T, autocovariance(lag, *CASES[case]), rtol=1e-9, atol=1e-11
+        )
 
 
 @pytest.mark.slow
@@ -115,30 +149,50 @@ def test_paths_have_variance_covariances_and_spectrum(case, precision):
         values = at_once(lambda key: path(jax.random.split(key, seeds)), KEY)
     assert values.dtype == precision and values.shape == (seeds, steps, 1)
     x = np.asarray(values, float)[..., 0]
-    lags, bins, taper = np.array([0, 1, 5, 14, 28, 100]), np.arange(2, 125, 3), scipy.signal.get_window("hann", steps)
-    seen = [x[:, 0] ** 2, x[:, -1] ** 2, *((x[:, : steps - k] * x[:, k:]).mean(axis=1) for k in lags)]
+    lags, bins, taper = (
+        np.array([0, 1, 5, 14, 28, 100]),
+        np.arange(2, 125, 3),
+        scipy.signal.get_window("hann", steps),
+    )
+    seen = [
+        x[:, 0] ** 2,
+        x[:, -1] ** 2,
+        *((x[:, : steps - k] * x[:, k:]).mean(axis=1) for k in lags),
+    ]
     r = autocovariance(dt * np.arange(steps), *CASES[case])
-    overlap = np.correlate(taper, taper, "full")[steps - 1 :] * r * np.where(np.arange(steps) > 0, 2, 1)
+    overlap = (
+        np.correlate(taper, taper, "full")[steps - 1 :] * r * np.where(np.arange(steps) > 0, 2, 1)
+    )
     expected = np.cos(2 * np.pi * np.outer(bins, np.arange(steps)) / steps) @ overlap
     power = np.abs(np.fft.rfft(x * taper, axis=1)[:, bins]) ** 2
 
     def standard(found, exact):
         return (found.mean(axis=0) - exact) / (found.std(axis=0, ddof=1) / np.sqrt(seeds))
 
-    # Lags of a path depend on each other: the bound alone. Bins three apart do not, unless one line leaks into all.
-    references.assert_standard_normal(standard(np.stack(seen, axis=1), np.r_[1.0, 1.0, r[lags]]), every=len(seen))
-    references.assert_standard_normal(standard(power, expected), every=len(bins) if case == "narrow" else 1)
+    # Lags of a path depend on each other: the bound alone. Bins three apart do not, unless one line
+    # leaks into all.
+    references.assert_standard_normal(
+        standard(np.stack(seen, axis=1), np.r_[1.0, 1.0, r[lags]]), every=len(seen)
+    )
+    references.assert_standard_normal(
+        standard(power, expected), every=len(bins) if case == "narrow" else 1
+    )
 
 
 @pytest.mark.slow
 def test_a_sum_is_its_parts(x64):
     band, tremor = jm.BandLimitedNoise({"K_w": 0.2}), jm.ResonantNoise(0.03)
     both, f = band + tremor, np.array([1.0, 9.0])
-    assert isinstance(both, NoiseSum) and [type(part) for part in both.components] == [type(band), type(tremor)]
+    assert isinstance(both, NoiseSum) and [type(part) for part in both.components] == [
+        type(band),
+        type(tremor),
+    ]
     assert len((both + tremor).components) == len((tremor + both).components) == 3
     rows = np.zeros((5, 2))
     rows[0], rows[4] = 0.04 / 100 / (1 + (f / 50) ** 4), 9e-4 * density(f, 9.0, 2.0)
-    independent, shared = (jm.ResonantNoise((0.1, 0.1, 0.0, 0.0, 0.2), shared=shared) for shared in (False, True))
+    independent, shared = (
+        jm.ResonantNoise((0.1, 0.1, 0.0, 0.0, 0.2), shared=shared) for shared in (False, True)
+    )
 
     def drawn(key):
         alone, together = (noise.per_channel().draw(key, 20) for noise in (band, both))
@@ -160,16 +214,25 @@ FAST = jm.ResonantNoise(0.1, 90.0, 20.0)
     "make, message",
     [
         (lambda: jm.ResonantNoise(width=0.0), "resonance_width = 0.0 Hz must be positive"),
-        (lambda: jm.ResonantNoise(frequency=-1.0), "resonance_frequency = -1.0 Hz must be positive"),
+        (
+            lambda: jm.ResonantNoise(frequency=-1.0),
+            "resonance_frequency = -1.0 Hz must be positive",
+        ),
         (lambda: jm.ResonantNoise(-0.1), "must not be negative"),
         (lambda: jm.ResonantNoise(np.ones(3)), r"shape \(3,\): give one number, four or five"),
         (lambda: NoiseSum(()), "needs at least one"),
         (lambda: (jm.BandLimitedNoise() + jm.ResonantNoise()).density(1.0), "no density"),
         (lambda: jm.simulate(jm.Isometric(noise=FAST), KEY), "too coarse for a resonance at 90"),
-        (lambda: jm.simulate(jm.Isometric(noise=jm.BandLimitedNoise() + FAST), KEY), "too coarse for a resonance at 90"),
-        (lambda: jm.PrescribedMotion(noise=jm.ResonantNoise({"K_z": 0.1})), "ResonantNoise on K_z cannot be used"),
+        (
+            lambda: jm.simulate(jm.Isometric(noise=jm.BandLimitedNoise() + FAST), KEY),
+            "too coarse for a resonance at 90",
+        ),
+        (
+            lambda: jm.PrescribedMotion(noise=jm.ResonantNoise({"K_z": 0.1})),
+            "ResonantNoise on K_z cannot be used",
+        ),
     ],
-)  # fmt: skip
+)
 def test_impossible_resonances_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()

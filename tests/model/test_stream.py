@@ -1,4 +1,5 @@
-"""Random numbers of a seed: their law, their independence, and that they are the same wherever they are made."""
+"""Random numbers of a seed: their law, their independence, and that they are the same wherever they
+are made."""
 
 import functools
 import itertools
@@ -29,13 +30,20 @@ def streams(seeds=SEEDS, key=KEY, draws=Draws()):  # noqa: B008
 
 def of_every(function, seeds=SEEDS, key=KEY, draws=Draws()):  # noqa: B008
     """What a function makes of the stream of every seed."""
-    made = at_once(lambda key: jax.vmap(lambda one: jnp.stack(function(one), axis=-1))(streams(seeds, key, draws)), key)
+    made = at_once(
+        lambda key: jax.vmap(lambda one: jnp.stack(function(one), axis=-1))(
+            streams(seeds, key, draws)
+        ),
+        key,
+    )
     return np.asarray(made)
 
 
 def normals_of(steps=STEPS, first=0, count=CHANNELS, **streams):
     """Normals of every seed, step and number."""
-    return of_every(lambda one: one.normals(jnp.arange(steps), first, count), **streams).astype(float)
+    return of_every(lambda one: one.normals(jnp.arange(steps), first, count), **streams).astype(
+        float
+    )
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +80,9 @@ def test_the_normal_of_a_word_is_the_inverse_of_the_distribution():
     halves = grid_of_words()
     tail = (halves + 0.5) * 2.0**-31
     exact = -scipy.special.ndtri(tail / 2)
-    up, down = (np.asarray(_normal(jnp.asarray(halves * 2 + sign, jnp.uint32)), float) for sign in (0, 1))
+    up, down = (
+        np.asarray(_normal(jnp.asarray(halves * 2 + sign, jnp.uint32)), float) for sign in (0, 1)
+    )
     np.testing.assert_array_equal(down, -up)
     # 31 bits are rounded to the 24 of single precision, which near 0 is 1.25 of 2^-24.
     assert np.all(np.abs(up - exact) <= 2e-5 * exact + 1.3 * 2.0**-24)
@@ -80,7 +90,9 @@ def test_the_normal_of_a_word_is_the_inverse_of_the_distribution():
     assert np.max(np.abs(up[seen] / exact[seen] - 1)) < 3e-5
     assert abs(up[0] - 6.34) < 0.01 and up.max() == up[0]
     # Single precision may turn neighbours round, by a few of its units.
-    assert np.all(np.diff(up) <= 8 * np.finfo(np.float32).eps * np.maximum(up[1:], 1)) and np.all(up >= 0)
+    assert np.all(np.diff(up) <= 8 * np.finfo(np.float32).eps * np.maximum(up[1:], 1)) and np.all(
+        up >= 0
+    )
 
 
 @pytest.mark.slow
@@ -88,35 +100,47 @@ def test_normals_are_normal(normals):
     z = normals.ravel()
     assert scipy.stats.kstest(z, "norm").pvalue > P_LEAST
     moments = np.array([0, 1, 0, 3, 0, 15, 0, 105])
-    spreads = np.sqrt(np.array([1, 3 - 1, 15, 105 - 9, 945, 10395 - 225, 135135, 2027025 - 105**2]) / z.size)
+    spreads = np.sqrt(
+        np.array([1, 3 - 1, 15, 105 - 9, 945, 10395 - 225, 135135, 2027025 - 105**2]) / z.size
+    )
     found = np.array([np.mean(z**n) for n in range(1, 9)])
     assert np.all(np.abs(found - moments) < 4.5 * spreads), (found - moments) / spreads
     # The tails: expected counts beyond 3, 4 and 4.5 standard deviations are 5700, 133 and 14.
     for level in (3.0, 4.0, 4.5):
         expected = 2 * scipy.stats.norm.sf(level) * z.size
-        assert P_LEAST < scipy.stats.poisson.cdf(np.sum(np.abs(z) > level), expected) < 1 - P_LEAST, level
+        assert (
+            P_LEAST < scipy.stats.poisson.cdf(np.sum(np.abs(z) > level), expected) < 1 - P_LEAST
+        ), level
 
 
 def together(pairs):
     """Correlations of paired numbers and of their sizes, over the last axis, in standard errors.
 
-    All that a test looks at in one array: a bound of 1 % is for the whole family. Not of squares, which are still far from
-    normal after a thousand pairs.
+    All that a test looks at in one array: a bound of 1 % is for the whole family. Not of squares,
+    which are still far from normal after a thousand pairs.
     """
     size = lambda x: (np.abs(x) - np.sqrt(2 / np.pi)) / np.sqrt(1 - 2 / np.pi)  # noqa: E731
-    found = [np.sum(f(a) * f(b), axis=-1) / np.sqrt(a.shape[-1]) for a, b in pairs for f in (lambda x: x, size)]
+    found = [
+        np.sum(f(a) * f(b), axis=-1) / np.sqrt(a.shape[-1])
+        for a, b in pairs
+        for f in (lambda x: x, size)
+    ]
     return np.concatenate([np.ravel(each) for each in found])
 
 
 @pytest.mark.slow
 def test_neighbouring_seeds_are_independent(normals):
     flat = normals.reshape(SEEDS, -1)
-    references.assert_standard_normal(together((flat[:-apart], flat[apart:]) for apart in (1, 2, 128)))
+    references.assert_standard_normal(
+        together((flat[:-apart], flat[apart:]) for apart in (1, 2, 128))
+    )
 
 
 def test_steps_are_independent(normals):
     rows = np.moveaxis(normals, 1, -1).reshape(-1, STEPS)
-    references.assert_standard_normal(together((rows[:, :-k], rows[:, k:]) for k in (1, 2, 3, 7, 64, 1024)))
+    references.assert_standard_normal(
+        together((rows[:, :-k], rows[:, k:]) for k in (1, 2, 3, 7, 64, 1024))
+    )
 
 
 def test_channels_are_independent(normals):
@@ -127,16 +151,22 @@ def test_channels_are_independent(normals):
 @pytest.mark.slow
 def test_parts_of_a_sum_and_the_start_are_independent(normals):
     later = normals_of(first=APART, count=1)[..., 0]
-    references.assert_standard_normal(together((channel, later) for channel in np.moveaxis(normals, -1, 0)))
+    references.assert_standard_normal(
+        together((channel, later) for channel in np.moveaxis(normals, -1, 0))
+    )
     begun = of_every(lambda one: one.normals(START, 0, CHANNELS), seeds=4096).astype(float)
     first = normals_of(1, seeds=4096)[:, 0]
-    assert abs(np.mean(begun)) < 4 / np.sqrt(begun.size) and abs(np.var(begun) - 1) < 4 * np.sqrt(2 / begun.size)
+    assert abs(np.mean(begun)) < 4 / np.sqrt(begun.size) and abs(np.var(begun) - 1) < 4 * np.sqrt(
+        2 / begun.size
+    )
     references.assert_standard_normal(together([(begun.T, first.T)]))
 
 
 def test_different_keys_make_different_noise(normals):
     other = normals_of(key=jax.random.key(22))
-    references.assert_standard_normal(together([(normals.reshape(SEEDS, -1), other.reshape(SEEDS, -1))]))
+    references.assert_standard_normal(
+        together([(normals.reshape(SEEDS, -1), other.reshape(SEEDS, -1))])
+    )
 
 
 @pytest.mark.slow
@@ -159,15 +189,19 @@ def equal_cells(counts):
 def test_bytes_are_equally_likely_alone_and_in_pairs(words, shift):
     byte = ((words >> np.uint32(shift)) & 255).astype(np.int64)
     assert equal_cells(np.bincount(byte.ravel(), minlength=256)) > P_LEAST
-    neighbours = {"seeds": (byte[:-1:2], byte[1::2]), "steps": (byte[:, :-1:2], byte[:, 1::2]),
-                  "channels": (byte[..., 0::2], byte[..., 1::2])}  # fmt: skip
+    neighbours = {
+        "seeds": (byte[:-1:2], byte[1::2]),
+        "steps": (byte[:, :-1:2], byte[:, 1::2]),
+        "channels": (byte[..., 0::2], byte[..., 1::2]),
+    }
     for name, (a, b) in neighbours.items():
         assert equal_cells(np.bincount((256 * a + b).ravel(), minlength=65536)) > P_LEAST, name
 
 
 @pytest.mark.parametrize("order", ["seed by seed", "step by step"])
 def test_birthday_spacings(words, order):
-    """Marsaglia's test: of m birthdays in n days the equal spacings are Poisson with mean m³ / 4n."""
+    """Marsaglia's test: of m birthdays in n days the equal spacings are Poisson with mean m³ /
+    4n."""
     line = words if order == "seed by seed" else np.moveaxis(words, 0, 1)
     birthdays = np.sort(line.reshape(-1, 4096).astype(np.int64), axis=1)
     spacings = np.sort(np.diff(birthdays, axis=1), axis=1)
@@ -187,10 +221,16 @@ def by_numpy(key, step, number):
 
     once = mixed(step ^ key[0], [(16, 0x7FEB352D), (15, 0x846CA68B)], 16) ^ key[1]
     golden = round(2**32 * (np.sqrt(5) - 1) / 2)
-    return mixed(cut(once + (number + 1) * golden), [(17, 0xED5AD4BB), (11, 0xAC4C1B51), (15, 0x31848BAB)], 14)
+    return mixed(
+        cut(once + (number + 1) * golden),
+        [(17, 0xED5AD4BB), (11, 0xAC4C1B51), (15, 0x31848BAB)],
+        14,
+    )
 
 
-@pytest.mark.parametrize("key", [(0, 0), (1, 0), (0x243F6A88, 0x85A308D3), (0xFFFFFFFF, 0xFFFFFFFF)])
+@pytest.mark.parametrize(
+    "key", [(0, 0), (1, 0), (0x243F6A88, 0x85A308D3), (0xFFFFFFFF, 0xFFFFFFFF)]
+)
 def test_words_are_those_of_the_formula(key):
     stream = Stream(KEY, jnp.array(key, jnp.uint32), Draws())
     steps = np.array([0, 1, 2, 14_999, 2**31 - 1, 2**32 - 1], np.uint32)
@@ -211,7 +251,10 @@ def test_a_number_depends_on_seed_step_and_place_alone(generator, increments):
 
     def batch(key, begin, seeds):
         def one(stream):
-            return jax.lax.map(lambda made: of_step(stream, made), stream.ahead(begin + jnp.arange(20), first, count))
+            return jax.lax.map(
+                lambda made: of_step(stream, made),
+                stream.ahead(begin + jnp.arange(20), first, count),
+            )
 
         return jax.vmap(one)(streams(seeds, key, draws))
 
@@ -229,7 +272,9 @@ def test_a_number_depends_on_seed_step_and_place_alone(generator, increments):
         for part, single in enumerate(at_once(alone, KEY, np.array([step]))):
             assert len(single) == count[part]
             # A product and a sum may be fused or not: a few units in the last place.
-            np.testing.assert_allclose(single, [x[2, step - 7] for x in found[part]], rtol=1e-6, atol=1e-7)
+            np.testing.assert_allclose(
+                single, [x[2, step - 7] for x in found[part]], rtol=1e-6, atol=1e-7
+            )
 
 
 @pytest.mark.slow
@@ -252,7 +297,9 @@ def test_both_precisions_have_the_same_numbers():
 def test_threefry_makes_other_numbers_of_the_same_law(normals):
     other = normals_of(512, seeds=64, draws=Draws.of("threefry", "gaussian"))
     assert scipy.stats.kstest(other.ravel(), "norm").pvalue > P_LEAST
-    references.assert_standard_normal(together([(other.reshape(64, -1), normals[:64, :512].reshape(64, -1))]))
+    references.assert_standard_normal(
+        together([(other.reshape(64, -1), normals[:64, :512].reshape(64, -1))])
+    )
 
 
 BAND = jm.BandLimitedNoise()
@@ -275,7 +322,9 @@ def largest(ours, given):
 
 
 def assert_drawn_on_the_way(noise, active):
-    task = as_arrays(jm.PrescribedForce(noise=noise, activation=jm.Activation() if active else None))
+    task = as_arrays(
+        jm.PrescribedForce(noise=noise, activation=jm.Activation() if active else None)
+    )
     grid = Grid(1e-3, 600, 5)
 
     def both(task, key):
@@ -308,5 +357,6 @@ def test_simulate_draws_from_the_key_folded_with_the_seed(x64):
         return respond(found.task, path, Grid(1e-3, 600, 10), "instant")[0]
 
     states = at_once(given, KEY)
-    # The filter's noise is a difference of nearly equal numbers: another program has it to 1e-10 or so.
+    # The filter's noise is a difference of nearly equal numbers: another program has it to 1e-10 or
+    # so.
     assert largest(np.asarray(found.states)[:61], states) < 1e-9

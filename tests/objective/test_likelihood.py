@@ -1,4 +1,5 @@
-"""The law of Welch bins and the likelihoods: against simulation, closed forms, scipy and finite differences."""
+"""The law of Welch bins and the likelihoods: against simulation, closed forms, scipy and finite
+differences."""
 
 import dataclasses
 import functools
@@ -16,7 +17,13 @@ import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._covariance import residual_covariance
-from jaxmuscle.objective._likelihood import _gamma_level, likeliest_offset, log_density, log_marginal, measured_bins
+from jaxmuscle.objective._likelihood import (
+    _gamma_level,
+    likeliest_offset,
+    log_density,
+    log_marginal,
+    measured_bins,
+)
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._bin_law import bin_rows, trial_samples, welch_law
@@ -46,7 +53,8 @@ def test_law_of_welch_bins_is_that_of_scipys_spectra_of_white_noise():
     law = welch_law(settings, np.arange(1, 31), (SEGMENTS,))
     powers = white_powers()
     degrees = 2 * powers.mean(0) ** 2 / powers.var(0)
-    # relative standard error of a variance of a gamma variable of shape ν/2: √((2 + 12/ν) / n); of 30 bins, 5 of them
+    # relative standard error of a variance of a gamma variable of shape ν/2: √((2 + 12/ν) / n); of
+    # 30 bins, 5 of them
     bound = 5 * np.sqrt((2 + 12 / law.degrees) / len(powers))
     assert np.all(np.abs(degrees / law.degrees - 1) < bound)
     assert law.degrees[0] < 0.85 * law.degrees[5]  # detrending and negative frequencies
@@ -64,20 +72,30 @@ def test_trials_add_their_degrees_of_freedom():
 
 @pytest.mark.slow
 def test_a_mean_of_seeds_without_control_scatters_as_that_of_so_many_spectra():
-    """Over the ten seconds that a fit simulates there is room for `SEGMENTS`. With a control variate nothing scatters."""
+    """Over the ten seconds that a fit simulates there is room for `SEGMENTS`. With a control
+    variate nothing scatters."""
     assert SEGMENTS == (1000 - 256) // 128 + 1
     target = jm.Target("white", np.ones(30), segments=SEGMENTS)
     problem = planned(jm.Isometric(), target, FitOptions(free=("c_w",))).problem
-    plain, controlled = (dataclasses.replace(problem, control=c).montecarlo(8).parts[0] for c in (False, True))
+    plain, controlled = (
+        dataclasses.replace(problem, control=c).montecarlo(8).parts[0] for c in (False, True)
+    )
     data, none = problem.linear().parts[0], np.zeros(30)
-    np.testing.assert_array_equal(residual_covariance(target, controlled, none), residual_covariance(target, data, none))
+    np.testing.assert_array_equal(
+        residual_covariance(target, controlled, none), residual_covariance(target, data, none)
+    )
     simulated = residual_covariance(target, plain, none) - residual_covariance(target, data, none)
     logs = np.log(white_powers().reshape(-1, 8, 30).mean(axis=1))
     rows = (logs - logs.mean(axis=1, keepdims=True)) / data.statistics.sd
     found, variance = np.cov(rows.T), np.diag(simulated)
     # 465 different entries; that the bins' law is approximate moves a correlation by up to 0.01
-    scale, correlation = np.sqrt(np.outer(variance, variance)), simulated / np.sqrt(np.outer(variance, variance))
-    assert np.all(np.abs(found / scale - correlation) < 5 * np.sqrt((1 + correlation**2) / len(rows)) + 0.01)
+    scale, correlation = (
+        np.sqrt(np.outer(variance, variance)),
+        simulated / np.sqrt(np.outer(variance, variance)),
+    )
+    assert np.all(
+        np.abs(found / scale - correlation) < 5 * np.sqrt((1 + correlation**2) / len(rows)) + 0.01
+    )
 
 
 def independent(bins):
@@ -106,7 +124,8 @@ def test_gamma_level():
 
 @pytest.mark.slow
 def test_slopes_by_hand_are_those_of_differences():
-    """With a line that fills some bins, one beyond the share that still scatters, and bins that are left out."""
+    """With a line that fills some bins, one beyond the share that still scatters, and bins that are
+    left out."""
     target = jm.load_target("vastus-lateralis-26mvc")
     bins = measured_bins(target, mask=np.arange(30) % 7 > 0)
     noise = np.asarray(jm.expected_spectrum(jm.task_for(target)).power)
@@ -119,7 +138,9 @@ def test_slopes_by_hand_are_those_of_differences():
     at, steps = np.r_[noise + line, line, 0.1], 1e-4 * np.r_[noise, noise, 1.0]
     # The density is -1e6 here: of a smaller step, rounding would be seen.
     around = at + np.concatenate([np.diag(steps), -np.diag(steps)])
-    slopes, heights = at_once(lambda at, around: (jax.grad(height)(at), jax.lax.map(height, around)), at, around)
+    slopes, heights = at_once(
+        lambda at, around: (jax.grad(height)(at), jax.lax.map(height, around)), at, around
+    )
     ahead, behind = np.split(np.asarray(heights), 2)
     np.testing.assert_allclose(slopes, (ahead - behind) / (2 * steps), rtol=1e-5, atol=1e-6)
 
@@ -150,7 +171,9 @@ def test_bins_left_out_do_not_count():
     moved = bins._replace(log_power=bins.log_power + 0.0)
     moved.log_power[[3, 20]] += 1.0
     E = jnp.linspace(1.0, 0.01, 30)
-    first, second = (log_marginal(jax.tree.map(jnp.asarray, b), E, jnp.zeros(30)) for b in (bins, moved))
+    first, second = (
+        log_marginal(jax.tree.map(jnp.asarray, b), E, jnp.zeros(30)) for b in (bins, moved)
+    )
     assert float(first) == pytest.approx(float(second), rel=1e-10)
 
 
@@ -166,7 +189,8 @@ SHAPES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_score_and_information(shape):
-    """At the truth the score has mean zero and the Fisher information as variance, over scipy's spectra of white noise."""
+    """At the truth the score has mean zero and the Fisher information as variance, over scipy's
+    spectra of white noise."""
     scores = _scores() @ SHAPES[shape]
     assert abs(scores.mean()) < 4 * scores.std() / np.sqrt(len(scores))
     bins = measured_bins(jm.Target("white", np.ones(30), segments=SEGMENTS))
@@ -177,13 +201,17 @@ def test_score_and_information(shape):
 
 @functools.cache
 def _scores():
-    bins = jax.tree.map(jnp.asarray, measured_bins(jm.Target("white", np.ones(30), segments=SEGMENTS)))
+    bins = jax.tree.map(
+        jnp.asarray, measured_bins(jm.Target("white", np.ones(30), segments=SEGMENTS))
+    )
     powers = white_powers()[:4000]
     shares = jnp.log(jnp.asarray(powers / powers.sum(axis=1, keepdims=True)))
     truth = jnp.log(jnp.asarray(np.sum(np.abs(bin_rows(jm.SpectrumSettings())) ** 2, axis=(1, 2))))
 
     def slope(log_power):
-        return jax.grad(lambda e: log_marginal(bins._replace(log_power=log_power), jnp.exp(e), jnp.zeros(30)))(truth)
+        return jax.grad(
+            lambda e: log_marginal(bins._replace(log_power=log_power), jnp.exp(e), jnp.zeros(30))
+        )(truth)
 
     return np.asarray(at_once(jax.vmap(slope), shares))
 
@@ -199,7 +227,9 @@ def bins_information(bins):
 @functools.cache
 def recording():
     seconds = 60.0
-    runs = jm.ensemble(jm.settled(jm.Isometric()), jax.random.key(3), seeds=1, duration=5 + seconds, control=False)
+    runs = jm.ensemble(
+        jm.settled(jm.Isometric()), jax.random.key(3), seeds=1, duration=5 + seconds, control=False
+    )
     return jm.Recording(np.asarray(runs.output[0]), 100, window=(5, 5 + seconds))
 
 
@@ -210,11 +240,20 @@ def test_a_coefficient_of_variation_adds_its_gaussian_density():
     task = jm.settled(jm.Isometric(settings=bare.settings))
     moments = expected_moments(as_arrays(task), bare.settings, WINDOW, trial_samples(bare))[0]
     for measured in (0.01, 0.03):
-        data = jm.Target("both", target.proportional_power, segments=target.segments, coefficient_of_variation=measured)
+        data = jm.Target(
+            "both",
+            target.proportional_power,
+            segments=target.segments,
+            coefficient_of_variation=measured,
+        )
         logs, sd = target_variation(data, task)
-        density = scipy.stats.norm.logpdf(np.log(moments.variation), np.log(measured), sd) + 0.5 * np.log(2 * np.pi)
+        density = scipy.stats.norm.logpdf(
+            np.log(moments.variation), np.log(measured), sd
+        ) + 0.5 * np.log(2 * np.pi)
         assert logs == pytest.approx(np.log(measured))
-        assert float(jm.log_likelihood(task, data) - jm.log_likelihood(task, bare)) == pytest.approx(density, rel=1e-6)
+        assert float(
+            jm.log_likelihood(task, data) - jm.log_likelihood(task, bare)
+        ) == pytest.approx(density, rel=1e-6)
 
 
 @pytest.mark.slow
@@ -225,10 +264,14 @@ def test_whittle_is_the_law_of_a_periodogram():
     spectrum = data.fft_spectrum(task.settings.replace(window="boxcar"))
     moments = expected_moments(as_arrays(task), spectrum.settings, (0.0, 60.0))[0]
     line, noise = np.asarray(moments.line), np.asarray(moments.power - moments.line)
-    density = scipy.stats.ncx2.logpdf(2 * np.asarray(spectrum.power) / noise, 2, 2 * line / noise) + np.log(2 / noise)
+    density = scipy.stats.ncx2.logpdf(
+        2 * np.asarray(spectrum.power) / noise, 2, 2 * line / noise
+    ) + np.log(2 / noise)
     assert float(jm.log_likelihood(task, data)) == pytest.approx(density.sum(), rel=1e-9)
     quiet = task.replace(harmonic_amplitude=0.0)
-    expected = np.asarray(jm.expected_spectrum(jm.settled(quiet), spectrum.settings, (0.0, 60.0)).power)
+    expected = np.asarray(
+        jm.expected_spectrum(jm.settled(quiet), spectrum.settings, (0.0, 60.0)).power
+    )
     plain = -np.sum(np.log(expected) + np.asarray(spectrum.power) / expected)
     assert float(jm.log_likelihood(quiet, data)) == pytest.approx(plain, rel=1e-9)
 
@@ -242,14 +285,18 @@ def test_likelihoods_are_differentiable(name):
         return jm.log_likelihood(jm.Isometric().replace(c_w=c_w), data)
 
     step = 1e-3
-    heights, slopes = at_once(lambda at: jax.lax.map(jax.value_and_grad(height), at), 60 + step * np.arange(-1.0, 2.0))
+    heights, slopes = at_once(
+        lambda at: jax.lax.map(jax.value_and_grad(height), at), 60 + step * np.arange(-1.0, 2.0)
+    )
     assert float(slopes[1]) == pytest.approx(float(heights[2] - heights[0]) / (2 * step), rel=1e-5)
 
 
 @pytest.mark.slow
 def test_a_recording_prefers_the_muscle_that_made_it():
     data = recording()
-    heights = [float(jm.log_likelihood(jm.Isometric().replace(c_w=c), data)) for c in (30.0, 60.0, 120.0)]
+    heights = [
+        float(jm.log_likelihood(jm.Isometric().replace(c_w=c), data)) for c in (30.0, 60.0, 120.0)
+    ]
     assert np.argmax(heights) == 1
 
 
@@ -258,4 +305,7 @@ def test_what_has_no_likelihood():
     with pytest.raises(ValueError, match="does not state its segments"):
         jm.log_likelihood(jm.Isometric(), jm.Target("bare", np.linspace(2, 1, 30)))
     with pytest.raises(ValueError, match="below half the sampling rate"):
-        jm.log_likelihood(jm.Isometric().replace(harmonic_frequency=60.0), jm.load_target("vastus-lateralis-26mvc"))
+        jm.log_likelihood(
+            jm.Isometric().replace(harmonic_frequency=60.0),
+            jm.load_target("vastus-lateralis-26mvc"),
+        )

@@ -1,4 +1,5 @@
-"""`jaxmuscle reproduce`: every row of the table on its numbers, the three readings, the figures, the page."""
+"""`jaxmuscle reproduce`: every row of the table on its numbers, the three readings, the figures,
+the page."""
 
 import functools
 import json
@@ -52,8 +53,19 @@ EXPECTED = {
     "window": (GIVEN, AGREES, (5.0, EXACT), (15.0, EXACT), (10.0, EXACT)),
     "max-124": (FITTED, DIFFERS, (4 * 100 / 256, EXACT), (4 * 100 / 256, EXACT), (1.567, LINEAR)),
     "varies": (TESTED, DIFFERS, (0.2055, 0.02), (0.05, EXACT), (0.1117, 0.02)),
-    "inverted-u": (TESTED, DIFFERS, (0.95, EXACT), (0.50, 0.05), (0.69, 0.05), (0.84, 0.05), (0, EXACT),
-                   (0.95, EXACT), (1.2753, LINEAR), (1.7776, LINEAR), (1.9686, LINEAR)),
+    "inverted-u": (
+        TESTED,
+        DIFFERS,
+        (0.95, EXACT),
+        (0.50, 0.05),
+        (0.69, 0.05),
+        (0.84, 0.05),
+        (0, EXACT),
+        (0.95, EXACT),
+        (1.2753, LINEAR),
+        (1.7776, LINEAR),
+        (1.9686, LINEAR),
+    ),
     "max-7": (FITTED, GRID, (18 * 100 / 256, EXACT), (7.015, LINEAR)),
     "max-7-only": (TESTED, DIFFERS, (18 * 100 / 256, EXACT), (7.015, LINEAR)),
     "largest": (GIVEN, AGREES, (0.95, EXACT), (0.017 * 2.757, LINEAR), (0.017 * 2.608, LINEAR)),
@@ -63,12 +75,35 @@ EXPECTED = {
     "low": (FITTED, AGREES, (100 / 256, EXACT)),
     "high": (FITTED, GRID, (11 * 100 / 256, EXACT), (4.249, LINEAR), (1, EXACT), (0.75, ONE)),
     "align": (ARITHMETIC, DIFFERS, ((1.24 - 0.391) * 2.56, EXACT), ((7 - 4.251) * 2.56, EXACT)),
-    "concentric": (GIVEN, UNCHECKED, (5, EXACT), (84.25, LINEAR), (100 / 256, EXACT), (11 * 100 / 256, EXACT), (5e-6, 1.0)),
+    "concentric": (
+        GIVEN,
+        UNCHECKED,
+        (5, EXACT),
+        (84.25, LINEAR),
+        (100 / 256, EXACT),
+        (11 * 100 / 256, EXACT),
+        (5e-6, 1.0),
+    ),
     "energy": (TESTED, DIFFERS, (0.7387, LINEAR), (0.9893, LINEAR), (0.9703, LINEAR)),
     "series": (TESTED, DIFFERS, (1.9e-5, 0.1), (0.8815, LINEAR), (0.39, RUNS)),
     "displacement": (GIVEN, AGREES, (100 / 256, EXACT), (11 * 100 / 256, EXACT), (0.0095, 0.02)),
-    "amplitudes": (GIVEN, AGREES, (0.0016, EXACT), (0.0016, EXACT), (0.0001, EXACT), (0.0001, EXACT)),
-    "variation": (TESTED, DIFFERS, (5.301e-4, LINEAR), (6.814e-4, LINEAR), (1.8e-3, RUNS), (7.1, RUNS), (24.5, LINEAR)),
+    "amplitudes": (
+        GIVEN,
+        AGREES,
+        (0.0016, EXACT),
+        (0.0016, EXACT),
+        (0.0001, EXACT),
+        (0.0001, EXACT),
+    ),
+    "variation": (
+        TESTED,
+        DIFFERS,
+        (5.301e-4, LINEAR),
+        (6.814e-4, LINEAR),
+        (1.8e-3, RUNS),
+        (7.1, RUNS),
+        (24.5, LINEAR),
+    ),
     "people": (GIVEN, AGREES, (0.017 * 1.0126, LINEAR), (0.017 * 2.757, LINEAR)),
     "smaller": (GIVEN, AGREES, (4.989e-4, EXACT), (7.459e-4, EXACT)),
     "smoother": (FITTED, AGREES, (0.0156, RUNS), (0.39, RUNS)),
@@ -86,14 +121,15 @@ EXPECTED = {
     "grid-7": (ARITHMETIC, GRID, (17 * 100 / 256, EXACT), (18 * 100 / 256, EXACT)),
     "taylor": (GIVEN, AGREES, (0.3, EXACT), (0.017, 0.02)),
     "readings": (TESTED, DIFFERS, (5, EXACT), (5, EXACT), (5, EXACT), (4, EXACT), (3, EXACT)),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
     """The whole command's work, once: what was found, and the folder.
 
-    In chunks of eight seeds, so that ensembles of 1, 16 and 32 seeds share a program: a seed is the same in any chunk.
+    In chunks of eight seeds, so that ensembles of 1, 16 and 32 seeds share a program: a seed is the
+    same in any chunk.
     """
     folder = tmp_path_factory.mktemp("reproduce")
     with pytest.MonkeyPatch.context() as patch:
@@ -129,7 +165,9 @@ def test_the_numbers_and_the_verdict_of_a_row(rows, key):
 
 def test_the_envelope_is_told_as_the_preset_has_it():
     (claim,) = (claim for claim in CLAIMS if claim.key == "changing")
-    told = re.search(r"envelope falls from ([\d.]+) at ([\d.]+) s to ([\d.]+) at ([\d.]+) s", claim.how)
+    told = re.search(
+        r"envelope falls from ([\d.]+) at ([\d.]+) s to ([\d.]+) at ([\d.]+) s", claim.how
+    )
     assert told is not None
     first, begin, last, end = map(float, told.groups())
     envelope = jm.load_preset("zagrodny-hamilton").harmonic.envelope
@@ -163,20 +201,29 @@ def test_only_what_tests_the_model_is_counted_for_it():
         return Row("key", kind, "source", "says", "ours", (), "how", verdict, "")
 
     rows = [row(TESTED, v) for v in (AGREES, GRID, DIFFERS, DIFFERS, UNCHECKED)]
-    rows += [row(FITTED, v) for v in (AGREES, DIFFERS)] + [row(GIVEN, AGREES)] * 3 + [row(ARITHMETIC, GRID)]
-    assert counted(rows) == (
-        "Of 11 statements 5 test the model: 2 agree (1 within our resolution), 2 do not, 1 cannot be checked. "
-        "Not counted for it: 2 fitted (1 of them not met), 3 put in, 1 arithmetic."
+    rows += (
+        [row(FITTED, v) for v in (AGREES, DIFFERS)]
+        + [row(GIVEN, AGREES)] * 3
+        + [row(ARITHMETIC, GRID)]
+    )
+    assert (
+        counted(rows)
+        == "Of 11 statements 5 test the model: 2 agree (1 within our resolution), 2 do not, 1"
+        " cannot be checked. Not counted for it: 2 fitted (1 of them not met), 3 put in, 1"
+        " arithmetic."
     )
     assert {row.kind for row in rows} == set(KINDS)
-    assert outcome([row(TESTED, GRID), row(TESTED, DIFFERS)]) == (
-        "1 agrees (1 within our resolution), 1 does not, 0 cannot be checked"
+    assert (
+        outcome([row(TESTED, GRID), row(TESTED, DIFFERS)])
+        == "1 agrees (1 within our resolution), 1 does not, 0 cannot be checked"
     )
 
 
 @pytest.mark.slow
 def test_the_document_counts_as_the_table_does(rows):
-    assert counted(rows.values()) in (pages.ROOT / "docs" / "reproduce.md").read_text(encoding="utf-8")
+    assert counted(rows.values()) in (pages.ROOT / "docs" / "reproduce.md").read_text(
+        encoding="utf-8"
+    )
 
 
 @pytest.mark.slow
@@ -184,17 +231,30 @@ def test_the_document_lists_what_does_not_agree(rows):
     """And what does: of each kind, by the keys of claims.json."""
     text = (pages.ROOT / "docs" / "reproduce.md").read_text(encoding="utf-8")
     table = text.partition("| key | stated |")[2].partition("\n\n")[0]
-    assert set(re.findall(r"^\| `([\w.-]+)`", table, re.MULTILINE)) == {k for k, r in rows.items() if r.verdict == DIFFERS}
-    listed = {kind: set(re.findall(r"`([\w.-]+)`", text.partition(f"**{kind}**")[2].partition("\n")[0])) for kind in KINDS}
-    assert listed == {kind: {key for key, row in rows.items() if row.kind == kind} for kind in KINDS}
+    assert set(re.findall(r"^\| `([\w.-]+)`", table, re.MULTILINE)) == {
+        k for k, r in rows.items() if r.verdict == DIFFERS
+    }
+    listed = {
+        kind: set(re.findall(r"`([\w.-]+)`", text.partition(f"**{kind}**")[2].partition("\n")[0]))
+        for kind in KINDS
+    }
+    assert listed == {
+        kind: {key for key, row in rows.items() if row.kind == kind} for kind in KINDS
+    }
 
 
 def test_the_levels_are_those_of_the_expected_fits():
-    written = (pages.ROOT / "src" / "jaxmuscle" / "paper" / "levels.toml").read_text(encoding="utf-8")
-    assert written == pages.module(pages.ROOT / "fitting" / "expected.py").levels(), "run `python fitting/expected.py NAME`"
+    written = (pages.ROOT / "src" / "jaxmuscle" / "paper" / "levels.toml").read_text(
+        encoding="utf-8"
+    )
+    assert written == pages.module(pages.ROOT / "fitting" / "expected.py").levels(), (
+        "run `python fitting/expected.py NAME`"
+    )
     fits = pages.ROOT / "fitting" / "expected"
     for level in (35, 95):
-        values = json.loads((fits / f"slifkin-newell-1999-{level}mvc.json").read_text(encoding="utf-8"))["values"]
+        values = json.loads(
+            (fits / f"slifkin-newell-1999-{level}mvc.json").read_text(encoding="utf-8")
+        )["values"]
         task = fitted(level)
         moved = {name for name in task.parameter_names if task[name] != jm.Isometric()[name]}
         assert moved == set(jm.model._parameters.DEFAULT_FREE)
@@ -202,10 +262,18 @@ def test_the_levels_are_those_of_the_expected_fits():
 
 
 def test_the_preset_of_figures_2_to_5_is_the_expected_fit_to_four_digits():
-    written = (pages.ROOT / "fitting" / "expected" / "zagrodny-fig4a.json").read_text(encoding="utf-8")
-    values = {name: row["value"] for name, row in json.loads(written)["values"].items() if name in jm.PARAMETERS}
+    written = (pages.ROOT / "fitting" / "expected" / "zagrodny-fig4a.json").read_text(
+        encoding="utf-8"
+    )
+    values = {
+        name: row["value"]
+        for name, row in json.loads(written)["values"].items()
+        if name in jm.PARAMETERS
+    }
     preset = jm.load_preset("zagrodny-slifkin")
-    assert {name: preset[name] for name in values} == {name: float(f"{value:.4g}") for name, value in values.items()}
+    assert {name: preset[name] for name in values} == {
+        name: float(f"{value:.4g}") for name, value in values.items()
+    }
 
 
 def test_an_inverted_u_rises_above_both_ends():
@@ -213,7 +281,9 @@ def test_an_inverted_u_rises_above_both_ends():
     noise = np.random.default_rng(0).normal(size=(3, 16))
 
     def rise(*means):
-        return Levels.entropy_rise.fget(SimpleNamespace(entropy=np.array(means)[:, None] + 0.1 * noise))
+        return Levels.entropy_rise.fget(
+            SimpleNamespace(entropy=np.array(means)[:, None] + 0.1 * noise)
+        )
 
     paired = scipy.stats.ttest_rel(2 + 0.1 * noise[1], 1.5 + 0.1 * noise[2]).statistic
     assert rise(1.0, 2.0, 1.5) == pytest.approx(paired, rel=1e-9)
@@ -222,7 +292,8 @@ def test_an_inverted_u_rises_above_both_ends():
 
 @pytest.mark.slow
 def test_the_share_within_the_bins_against_a_simulation(done):
-    """scipy's Welch of the 32 runs up to 50 Hz; few bins of slow noise hold much of the power, so the share errs by 2 %."""
+    """scipy's Welch of the 32 runs up to 50 Hz; few bins of slow noise hold much of the power, so
+    the share errs by 2 %."""
     run = done[0].slifkin.force
     passed = run.filtered()
     power = scipy.signal.welch(passed, 100.0, nperseg=256, detrend="constant")[1].mean(0)
@@ -231,17 +302,27 @@ def test_the_share_within_the_bins_against_a_simulation(done):
 
 @pytest.mark.slow
 def test_the_three_readings(done):
-    """A lacks the low sine, B (which has it) is not Task 1, B in Task 1 has no second maximum, C no local maximum."""
+    """A lacks the low sine, B (which has it) is not Task 1, B in Task 1 has no second maximum, C no
+    local maximum."""
     found = {r.key: r for r in done[0].readings}
-    missing = {key: {name for name, holds in r.facts.items() if not holds} for key, r in found.items()}
-    assert missing == {"A": {"sine"}, "B": {"task"}, "B1": {"high"}, "C1": {"high", "sine"}, "C2": {"high", "sine", "fast"}}
+    missing = {
+        key: {name for name, holds in r.facts.items() if not holds} for key, r in found.items()
+    }
+    assert missing == {
+        "A": {"sine"},
+        "B": {"task"},
+        "B1": {"high"},
+        "C1": {"high", "sine"},
+        "C2": {"high", "sine", "fast"},
+    }
     assert "No reading gives all" in conclusion(done[0].readings)
     p = np.asarray(found["C1"].spectrum.power)
     assert p[0] / p.sum() > 0.999  # the mean of the force has leaked into bin 1
 
 
 def test_first_order_response_has_no_local_maximum():
-    """(a + bw + cw²)/(w + p²), w = ω² > 0, a, c, p² > 0, has at most one turning point, a minimum."""
+    """(a + bw + cw²)/(w + p²), w = ω² > 0, a, c, p² > 0, has at most one turning point, a
+    minimum."""
     rng = np.random.default_rng(0)
     w = np.geomspace(1e-4, 1e6, 20001)
     for _ in range(200):
@@ -274,8 +355,20 @@ def test_figures_and_page_are_written(done):
     for name in FIGURES:
         assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
         assert (folder / f"{name}.pdf").read_bytes()[:4] == b"%PDF"
-    assert set(FIGURES) >= {"fig2", "fig3", "fig4a", "fig4b", "fig5", "fig6a", "fig6b", "fig7", "fig8"}
-    assert [row["key"] for row in json.loads((folder / "claims.json").read_text())] == [claim.key for claim in CLAIMS]
+    assert set(FIGURES) >= {
+        "fig2",
+        "fig3",
+        "fig4a",
+        "fig4b",
+        "fig5",
+        "fig6a",
+        "fig6b",
+        "fig7",
+        "fig8",
+    }
+    assert [row["key"] for row in json.loads((folder / "claims.json").read_text())] == [
+        claim.key for claim in CLAIMS
+    ]
     assert not list(folder.glob(".*")), "no temporary file is left"
 
 
@@ -290,7 +383,9 @@ class _Page(HTMLParser):
         found = dict(attrs)
         self.links += [found[key] for key in ("href", "src") if key in found]
         self.ids += [found["id"]] if "id" in found else []
-        self.viewport |= found.get("name") == "viewport" and "width=device-width" in found["content"]
+        self.viewport |= (
+            found.get("name") == "viewport" and "width=device-width" in found["content"]
+        )
         if tag not in ("meta", "img"):
             self.open.append(tag)
 
@@ -317,7 +412,12 @@ def _recordings(seconds=(60.0, 60.0, 60.0), unit="mm"):
 
     def one(number, length):
         t = np.arange(round(120 * length)) / 120
-        return Recording(np.sin(2 * np.pi * t) + rng.normal(size=t.size), 120.0, unit=unit, name=f"subject {number}")
+        return Recording(
+            np.sin(2 * np.pi * t) + rng.normal(size=t.size),
+            120.0,
+            unit=unit,
+            name=f"subject {number}",
+        )
 
     return [one(i, length) for i, length in enumerate(seconds)]
 
@@ -346,7 +446,11 @@ def test_recordings_from_files(tmp_path):
     with pytest.raises(ValueError, match="rate"):
         given_recordings(files)
     np.savetxt(
-        files[0], np.c_[_recordings()[0].time, _recordings()[0].samples], delimiter=",", header="time,x (mm)", comments=""
+        files[0],
+        np.c_[_recordings()[0].time, _recordings()[0].samples],
+        delimiter=",",
+        header="time,x (mm)",
+        comments="",
     )
     assert given_recordings([files[0]] * 3)[0].unit == "mm"
 
@@ -359,6 +463,8 @@ def test_wrong_recordings_are_refused(tmp_path):
     app = typer.Typer()
     app.command()(command)
     missing = str(Path(tmp_path) / "none.csv")
-    answer = CliRunner().invoke(app, ["--out", str(tmp_path / "out"), *["--recording", missing] * 3])
+    answer = CliRunner().invoke(
+        app, ["--out", str(tmp_path / "out"), *["--recording", missing] * 3]
+    )
     assert answer.exit_code == 2
     assert "none.csv" in answer.output

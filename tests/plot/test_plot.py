@@ -1,4 +1,5 @@
-"""Figures: the right data with the right units, in the caller's axes, without a trace in matplotlib's settings."""
+"""Figures: the right data with the right units, in the caller's axes, without a trace in
+matplotlib's settings."""
 
 import types
 
@@ -52,7 +53,16 @@ def trajectories(seeds, task=None):
     output = 2.0 + 0.01 * np.random.default_rng(1).normal(size=(*seeds, samples))
     task = Isometric() if task is None else task
     states = np.zeros((*seeds, samples, len(task.state_names)))
-    return Trajectory(task, states, output, np.arange(seeds[0]) if seeds else np.array(0), 100.0, 1e-3, 1, "instant")
+    return Trajectory(
+        task,
+        states,
+        output,
+        np.arange(seeds[0]) if seeds else np.array(0),
+        100.0,
+        1e-3,
+        1,
+        "instant",
+    )
 
 
 def band(ax):
@@ -78,7 +88,10 @@ def test_spectrum_of_one_seed_is_its_proportional_power():
     (line,) = ax.lines
     np.testing.assert_array_equal(line.get_xdata(), F)
     np.testing.assert_allclose(line.get_ydata(), one.power / one.power.sum(), rtol=1e-12)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Proportional power (fraction per bin)")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (
+        "Frequency (Hz)",
+        "Proportional power (fraction per bin)",
+    )
     assert not ax.collections and ax.get_legend() is None
 
 
@@ -90,7 +103,10 @@ def test_spectrum_of_seeds_normalises_the_mean_power_and_shows_90_percent_of_the
     np.testing.assert_allclose(ax.lines[0].get_ydata(), mean / mean.sum(), rtol=1e-12)
     each = (several.power / several.power.sum(-1, keepdims=True)).reshape(40, -1)
     np.testing.assert_allclose(band(ax), np.quantile(each, (0.05, 0.95), axis=0), rtol=1e-12)
-    assert [t.get_text() for t in ax.get_legend().get_texts()] == ["5 to 95 % of seeds", "mean of 40 seeds"]
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == [
+        "5 to 95 % of seeds",
+        "mean of 40 seeds",
+    ]
 
 
 def test_spectrum_in_absolute_units():
@@ -140,11 +156,15 @@ def test_target_with_segments_has_the_band_of_its_degrees_of_freedom():
     aim = load_target("vastus-lateralis-26mvc")
     ax = plot.target(aim)
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), aim.proportional_power)
-    half = welch_law(aim.settings, aim.bins, aim.segments).degrees / 2  # tests/spectra checks it by simulation
+    # tests/spectra checks it by simulation
+    half = welch_law(aim.settings, aim.bins, aim.segments).degrees / 2
     bias, sd = scipy.special.psi(half) - np.log(half), np.sqrt(scipy.special.polygamma(1, half))
     edges = [aim.proportional_power * np.exp(-bias + side * sd) for side in (-1, 1)]
     np.testing.assert_allclose(band(ax), edges, rtol=1e-12)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Proportional power (fraction per bin)")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (
+        "Frequency (Hz)",
+        "Proportional power (fraction per bin)",
+    )
     assert ax.lines[0].get_label() == "vastus-lateralis-26mvc (measured)"
 
 
@@ -166,7 +186,9 @@ def test_target_with_sigma_has_its_band_and_says_that_it_is_assumed():
     ax = plot.target(aim, log=True)
     sd = np.sqrt(np.log(1 + (aim.sigma / aim.proportional_power) ** 2))
     np.testing.assert_allclose(
-        band(ax), [aim.proportional_power * np.exp(-sd), aim.proportional_power * np.exp(sd)], rtol=1e-12
+        band(ax),
+        [aim.proportional_power * np.exp(-sd), aim.proportional_power * np.exp(sd)],
+        rtol=1e-12,
     )
     labels = [t.get_text() for t in ax.get_legend().get_texts()]
     assert labels == ["± 1 SD (assumed)", "slifkin-newell-1999-95mvc (reconstructed)"]
@@ -241,7 +263,9 @@ def test_arrays_of_jax_are_drawn():
 
 def estimate(value, unit, stderr=None, free=True, identifiable=None):
     known = stderr is not None if identifiable is None else identifiable
-    return types.SimpleNamespace(value=value, unit=unit, stderr=stderr, free=free, identifiable=known)
+    return types.SimpleNamespace(
+        value=value, unit=unit, stderr=stderr, free=free, identifiable=known
+    )
 
 
 def result(**changes):
@@ -275,7 +299,11 @@ def result(**changes):
         "frequency_hz": f,
         "fitted": fitted,
         "harmonic_share": share,
-        "components": {"relaxation": 0.9 * (1 - share), "floor": 0.1 * (1 - share), "harmonic": share},
+        "components": {
+            "relaxation": 0.9 * (1 - share),
+            "floor": 0.1 * (1 - share),
+            "harmonic": share,
+        },
         "model": "Isometric, BandLimitedNoise",
         "residual": residual,
         "deviation": np.full(f.size, 0.3),
@@ -284,8 +312,13 @@ def result(**changes):
         "stretch": (10 + np.arange(500) / 100, 5 + 0.01 * np.sin(np.arange(500))),
         "starts": ((), ()),
         "notices": (),
-        "remarks": ("simulation and closed formula (linear response) differ by at most 0.2 % of a bin",),
-        "profile": (np.linspace(0.4, 11.7, 64), 10 - 9 * np.exp(-((np.linspace(0.4, 11.7, 64) - 3.9) ** 2))),
+        "remarks": (
+            "simulation and closed formula (linear response) differ by at most 0.2 % of a bin",
+        ),
+        "profile": (
+            np.linspace(0.4, 11.7, 64),
+            10 - 9 * np.exp(-((np.linspace(0.4, 11.7, 64) - 3.9) ** 2)),
+        ),
         "harmonic_p_value": 0.08,
         "seed": 7,
         "stiffness": None,
@@ -300,11 +333,25 @@ def result(**changes):
 def failed():
     nothing = np.full(30, np.nan)
     return result(
-        success=False, message="no start has a finite spectrum: lower the noise", derived={}, chi2_per_bin=None,
-        adequate=None, adequacy_p=None, verdict="not fitted: no start has a finite spectrum: lower the noise",
-        rms_log_error=None, fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
-        undetermined=(), stretch=(np.zeros(0), np.zeros(0)), seed=None, remarks=(), profile=None, harmonic_p_value=None,
-    )  # fmt: skip
+        success=False,
+        message="no start has a finite spectrum: lower the noise",
+        derived={},
+        chi2_per_bin=None,
+        adequate=None,
+        adequacy_p=None,
+        verdict="not fitted: no start has a finite spectrum: lower the noise",
+        rms_log_error=None,
+        fitted=nothing,
+        harmonic_share=nothing,
+        residual=nothing,
+        deviation=None,
+        undetermined=(),
+        stretch=(np.zeros(0), np.zeros(0)),
+        seed=None,
+        remarks=(),
+        profile=None,
+        harmonic_p_value=None,
+    )
 
 
 def panels(figure):
@@ -321,15 +368,30 @@ def key(figure):
 def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
     f = result().frequency_hz
     tremor = np.where(np.abs(f - 9) < 1, 0.8, 0.0)
-    parts = {"relaxation": 0.7 * (1 - tremor), "floor": 0.3 * (1 - tremor), "harmonic": 0 * f, "tremor": tremor}
+    parts = {
+        "relaxation": 0.7 * (1 - tremor),
+        "floor": 0.3 * (1 - tremor),
+        "harmonic": 0 * f,
+        "tremor": tremor,
+    }
     task = on_rung(Isometric(), 2)
-    found = result(components=parts, task=task, model="Isometric, BandLimitedNoise + ResonantNoise, activation")
+    found = result(
+        components=parts, task=task, model="Isometric, BandLimitedNoise + ResonantNoise, activation"
+    )
     figure = plot.fit(found)
     linear, logarithmic, _, _ = panels(figure)
     labels = [label for label in key(figure) if label.endswith("% of power")]
-    assert [label.partition(",")[0] for label in labels] == ["floor", "relaxation", "tremor (all bins)"]
-    assert sum(int(label.split(", ")[1].split()[0]) for label in labels) == pytest.approx(100, abs=2)
-    top = max(path.vertices[:, 1].max() for area in linear.collections[-3:] for path in area.get_paths())
+    assert [label.partition(",")[0] for label in labels] == [
+        "floor",
+        "relaxation",
+        "tremor (all bins)",
+    ]
+    assert sum(int(label.split(", ")[1].split()[0]) for label in labels) == pytest.approx(
+        100, abs=2
+    )
+    top = max(
+        path.vertices[:, 1].max() for area in linear.collections[-3:] for path in area.get_paths()
+    )
     assert top == pytest.approx(found.fitted.max())
     assert len(logarithmic.lines) == len(linear.lines) + 3  # a line for each instead
 
@@ -339,8 +401,15 @@ def of_two_resonances(tremor, **changes):
     f = result().frequency_hz
     second = np.where(f < 4, 0.13, 0.0)
     rest = 1 - tremor - second
-    parts = {"relaxation": 0.9 * rest, "floor": 0.1 * rest, "tremor": tremor + 0 * f, "resonance_2": second}
-    task = on_rung(Isometric(), 3).replace(**({"resonance_frequency": 9.22, "resonance_2_frequency": 3.7} | changes))
+    parts = {
+        "relaxation": 0.9 * rest,
+        "floor": 0.1 * rest,
+        "tremor": tremor + 0 * f,
+        "resonance_2": second,
+    }
+    task = on_rung(Isometric(), 3).replace(
+        **({"resonance_frequency": 9.22, "resonance_2_frequency": 3.7} | changes)
+    )
     return result(components=parts, task=task, profile=None)
 
 
@@ -352,8 +421,13 @@ def test_the_frequencies_of_resonances_are_marked_in_the_colours_of_their_parts(
         assert key(figure).count(name) == 1
         for ax in (linear, logarithmic):
             mark = named(ax, name)
-            assert list(mark.get_xdata()) == [where] and (mark.get_marker(), mark.get_color()) == ("^", color)
-            assert [line.get_color() for line in ax.lines if list(line.get_xdata()) == [where, where]] == [color]
+            assert list(mark.get_xdata()) == [where] and (mark.get_marker(), mark.get_color()) == (
+                "^",
+                color,
+            )
+            assert [
+                line.get_color() for line in ax.lines if list(line.get_xdata()) == [where, where]
+            ] == [color]
     assert not any(label.startswith("harmonic") for label in key(figure))
 
 
@@ -364,9 +438,10 @@ def test_the_words_below_a_fit_of_two_resonances_find_room_in_its_width():
     assert words.x0 >= 0 and words.x1 <= figure.bbox.width
 
 
-@pytest.mark.parametrize(("frequency", "share", "words"), [
-    (25.0, 0.2, ["tremor in the drive: 25.00 Hz"]), (9.22, 1e-6, []),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("frequency", "share", "words"),
+    [(25.0, 0.2, ["tremor in the drive: 25.00 Hz"]), (9.22, 1e-6, [])],
+)
 def test_a_tremor_outside_the_bins_or_without_power_is_not_marked_there(frequency, share, words):
     ax = panels(plot.fit(of_two_resonances(share, resonance_frequency=frequency)))[0]
     marks = [line for line in ax.lines if str(line.get_label()).startswith("tremor in")]
@@ -379,7 +454,9 @@ def test_fit_draws_the_fitted_spectrum_twice_with_target_and_harmonic():
     linear, logarithmic, _, _ = panels(plot.fit(found))
     for ax, scale in ((linear, "linear"), (logarithmic, "log")):
         assert (ax.get_xscale(), ax.get_yscale()) == (scale, scale)
-        np.testing.assert_array_equal(named(ax, "data").get_ydata(), found.target.proportional_power)
+        np.testing.assert_array_equal(
+            named(ax, "data").get_ydata(), found.target.proportional_power
+        )
         np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
         held = 100 * np.sum(found.fitted * found.harmonic_share)
         assert named(ax, f"harmonic: 3.90 Hz, {held:.2g} % of power").get_xdata() == [3.9]
@@ -391,7 +468,9 @@ def test_fit_draws_residuals_in_standard_deviations_and_marks_the_large_ones():
     ax = panels(plot.fit(found))[2]
     bars = ax.containers[0].patches
     np.testing.assert_array_equal([bar.get_height() for bar in bars], found.residual)
-    np.testing.assert_allclose([bar.get_x() + bar.get_width() / 2 for bar in bars], found.frequency_hz)
+    np.testing.assert_allclose(
+        [bar.get_x() + bar.get_width() / 2 for bar in bars], found.frequency_hz
+    )
     outside = [bar.get_facecolor() == to_rgba(plot.VERMILLION) for bar in bars]
     assert outside == list(np.abs(found.residual) > 2)
     explained = [i for i, bar in enumerate(bars) if bar.get_label() == "residual beyond 2 SD"]
@@ -408,7 +487,9 @@ def test_fit_draws_the_simulated_stretch():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("Time (s)", r"Force $F_\mathrm{ext}$ (N)")
     without_newtons = result(per_newton={"K_w0": 63.0})
     ax = panels(plot.fit(without_newtons))[3]
-    np.testing.assert_allclose(ax.lines[0].get_ydata(), found.stretch[1] / np.mean(found.stretch[1]))
+    np.testing.assert_allclose(
+        ax.lines[0].get_ydata(), found.stretch[1] / np.mean(found.stretch[1])
+    )
     assert ax.get_ylabel() == "Force / mean"
 
 
@@ -416,12 +497,23 @@ def test_fit_draws_the_simulated_stretch():
     ("changes", "title", "closeness", "colour"),
     [
         ({}, "vastus-lateralis-26mvc", "χ² per bin 1.18, p = 0.2", _plot_fit.DARK_GREEN),
-        ({"adequate": False, "adequacy_p": 1e-9, "closeness": "chi2 per bin 5.50"},
-         "vastus-lateralis-26mvc\nDoes not describe the data", "χ² per bin 5.50, p <= 0.001", plot.VERMILLION),
-        ({"adequate": None, "adequacy_p": None}, "vastus-lateralis-26mvc", "χ² per bin 1.21", "black"),
+        (
+            {"adequate": False, "adequacy_p": 1e-9, "closeness": "chi2 per bin 5.50"},
+            "vastus-lateralis-26mvc\nDoes not describe the data",
+            "χ² per bin 5.50, p <= 0.001",
+            plot.VERMILLION,
+        ),
+        (
+            {"adequate": None, "adequacy_p": None},
+            "vastus-lateralis-26mvc",
+            "χ² per bin 1.21",
+            "black",
+        ),
     ],
-)  # fmt: skip
-def test_fit_shows_its_verdict_by_a_label_and_a_colour_and_no_prose(changes, title, closeness, colour):
+)
+def test_fit_shows_its_verdict_by_a_label_and_a_colour_and_no_prose(
+    changes, title, closeness, colour
+):
     figure = plot.fit(result(**changes))
     assert figure.get_suptitle() == title
     ax = panels(figure)[2]
@@ -441,7 +533,10 @@ def test_fit_draws_the_profile_over_the_frequency():
 def test_fit_of_a_reconstruction_says_so():
     aim = load_target("slifkin-newell-1999-35mvc")
     figure = plot.fit(result(target=aim))
-    assert figure.get_suptitle() == "slifkin-newell-1999-35mvc (reconstructed)" and "data, reconstructed" in key(figure)
+    assert (
+        figure.get_suptitle() == "slifkin-newell-1999-35mvc (reconstructed)"
+        and "data, reconstructed" in key(figure)
+    )
 
 
 def test_a_failed_fit_still_shows_the_target_and_the_reason():
@@ -454,7 +549,9 @@ def test_a_failed_fit_still_shows_the_target_and_the_reason():
 
 def test_a_fit_without_known_spread_draws_logarithms_without_bands():
     aim = Target("few bins", [0.5, 0.3, 0.2], bins=[2, 3, 4])
-    figure = plot.fit(result(target=aim, chi2_per_bin=None, adequate=None, adequacy_p=None, deviation=None))
+    figure = plot.fit(
+        result(target=aim, chi2_per_bin=None, adequate=None, adequacy_p=None, deviation=None)
+    )
     figure.canvas.draw()
     ax = panels(figure)[2]
     assert ax.get_ylabel() == "Residual (ln units)" and len(ax.patches) == 3
@@ -466,7 +563,9 @@ def test_a_harmonic_outside_the_bins_or_without_power_is_not_marked_there(freque
     task = Isometric().replace(harmonic_frequency=frequency)
     ax = panels(plot.fit(result(task=task, harmonic_share=np.full(30, share))))[0]
     marks = [line for line in ax.lines if str(line.get_label()).startswith("harmonic")]
-    assert [line.get_label() for line in marks] == ["harmonic: 25.00 Hz, <0.1 % of power"] * (share > 0)
+    assert [line.get_label() for line in marks] == ["harmonic: 25.00 Hz, <0.1 % of power"] * (
+        share > 0
+    )
     assert all(line.get_xdata().size == 0 for line in marks)
     assert ax.get_xlim()[1] < 13
 
@@ -475,12 +574,20 @@ def test_letters_of_a_fit_are_legible_in_a_column_of_a_journal_and_titles_do_not
     figure = plot.fit(result(target=Target("a name " * 20, np.ones(30), segments=12)))
     figure.canvas.draw()
     width, _ = figure.canvas.get_width_height()
-    titles = [[t.get_window_extent() for t in (ax._left_title, ax._right_title) if t.get_text()] for ax in figure.axes]
+    titles = [
+        [t.get_window_extent() for t in (ax._left_title, ax._right_title) if t.get_text()]
+        for ax in figure.axes
+    ]
     assert all(box.x1 <= width for boxes in titles for box in boxes)
-    assert not any(a.overlaps(b) for boxes in titles for i, a in enumerate(boxes) for b in boxes[:i])
-    ends = sorted(box.x1 for box in (boxes[0] for boxes in titles[:3:2]))  # left of the panels beside them
+    assert not any(
+        a.overlaps(b) for boxes in titles for i, a in enumerate(boxes) for b in boxes[:i]
+    )
+    # left of the panels beside them
+    ends = sorted(box.x1 for box in (boxes[0] for boxes in titles[:3:2]))
     assert ends[-1] < figure.axes[1].get_window_extent().x0
-    sizes = [tick.label1.get_fontsize() for ax in figure.axes for tick in ax.xaxis.get_major_ticks()]
+    sizes = [
+        tick.label1.get_fontsize() for ax in figure.axes for tick in ax.xaxis.get_major_ticks()
+    ]
     assert min(sizes) * 85 / 25.4 / figure.get_figwidth() > 5.5  # points
 
 
@@ -504,11 +611,18 @@ def test_numbers_are_printed_to_two_digits_of_their_error(shown, expected):
 
 def steady(count, unit="N"):
     """A report of trials whose numbers are known."""
-    names = ("power_0_0.5", "power_above_12", *_plot_steadiness.VARIATIONS.values(), *_plot_steadiness.REGULARITY.values())
+    names = (
+        "power_0_0.5",
+        "power_above_12",
+        *_plot_steadiness.VARIATIONS.values(),
+        *_plot_steadiness.REGULARITY.values(),
+    )
 
     def measures(i):
         return {
-            name: types.SimpleNamespace(value=0.1 * (k + 1) + 0.01 * i, interval=(0.05 * (k + 1), k + 1.0))
+            name: types.SimpleNamespace(
+                value=0.1 * (k + 1) + 0.01 * i, interval=(0.05 * (k + 1), k + 1.0)
+            )
             for k, name in enumerate(names)
         }
 
@@ -516,18 +630,26 @@ def steady(count, unit="N"):
     return types.SimpleNamespace(unit=unit, trials=trials, measures=measures(1))
 
 
-@pytest.mark.parametrize(("count", "unit", "label"), [(3, "N", "Power (N²)"), (1, "% MVC", "Power ((% MVC)²)")])
+@pytest.mark.parametrize(
+    ("count", "unit", "label"), [(3, "N", "Power (N²)"), (1, "% MVC", "Power ((% MVC)²)")]
+)
 def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
     figure = plot.steadiness(steady(count, unit))
     figure.canvas.draw()
     power, variation, regularity = figure.axes
     assert power.get_ylabel() == label and power.get_yscale() == "log"
     assert [tick.get_text() for tick in power.get_xticklabels()] == ["0 to\n0.5", "12 to\n30"]
-    dots = [line for ax in figure.axes for line in ax.lines if line.get_label() == "trials, in their order"]
+    dots = [
+        line
+        for ax in figure.axes
+        for line in ax.lines
+        if line.get_label() == "trials, in their order"
+    ]
     assert [line.get_ydata().size for line in dots] == ([6, 9, 9] if count > 1 else [])
     np.testing.assert_allclose(variation.containers[0].lines[0].get_ydata(), [31, 41, 51])
     np.testing.assert_allclose(regularity.containers[0].lines[0].get_ydata(), [0.61, 0.71, 0.81])
-    (bars,) = variation.containers[0].lines[2]  # the ends of the 95 % intervals, in percent of the mean
+    # the ends of the 95 % intervals, in percent of the mean
+    (bars,) = variation.containers[0].lines[2]
     ends = np.array([bar[:, 1] for bar in bars.get_segments()])
     np.testing.assert_allclose(ends, [[15, 300], [20, 400], [25, 500]])
     if count > 1:  # the mean hides no trial
@@ -538,7 +660,11 @@ def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
 
 def test_starts_are_drawn_in_the_order_of_where_they_ended():
     ended = [(9.0, True), (4.0, True), (None, False), (4.5, False), (4.0, True)]
-    ax = plot.starts(types.SimpleNamespace(starts=tuple(types.SimpleNamespace(cost=c, success=s) for c, s in ended)))
+    ax = plot.starts(
+        types.SimpleNamespace(
+            starts=tuple(types.SimpleNamespace(cost=c, success=s) for c, s in ended)
+        )
+    )
     settled, other = ax.lines
     np.testing.assert_allclose(settled.get_xydata(), [[1, 0], [2, 0], [4, 10]])
     np.testing.assert_allclose(other.get_xydata(), [[3, 1]])
@@ -549,10 +675,13 @@ def test_starts_are_drawn_in_the_order_of_where_they_ended():
 def test_end_values_of_starts_are_drawn_over_those_of_the_best():
     ended = [(9.0, (4.0, 1.0, 3.0)), (4.0, (2.0, -1.0, 3.0)), (None, ()), (4.5, (1.0, 0.5, 6.0))]
     starts = tuple(types.SimpleNamespace(cost=c, success=True, values=v) for c, v in ended)
-    ax = plot.start_values(types.SimpleNamespace(starts=starts, settings={"free": ["k_w", "x_z", "c_w"]}))
+    ax = plot.start_values(
+        types.SimpleNamespace(starts=starts, settings={"free": ["k_w", "x_z", "c_w"]})
+    )
     drawn = [line.get_xydata().tolist() for line in ax.lines]  # the best last, above the others
     assert drawn == [[[2, 0], [1, 1]], [[0.5, 0], [2, 1]], [[1, 0], [1, 1]]]
-    assert [tick.get_text() for tick in ax.get_yticklabels()] == ["k_w", "c_w"]  # a negative value has no logarithm
+    # a negative value has no logarithm
+    assert [tick.get_text() for tick in ax.get_yticklabels()] == ["k_w", "c_w"]
     assert ax.get_xscale() == "log" and ax.lines[-1].get_color() == "black"
     bar = ax.figure.axes[1]
     assert bar.get_ylabel() == "Rise of χ²" and bar.get_ylim() == pytest.approx((0.0, 10.0))
@@ -565,21 +694,31 @@ def test_end_values_of_starts_are_drawn_over_those_of_the_best():
 def test_components_add_up_to_the_fit(log):
     f = result().frequency_hz
     tremor = np.where(np.abs(f - 9) < 1, 0.8, 0.0)
-    found = result(components={"relaxation": 0.7 * (1 - tremor), "floor": 0.3 * (1 - tremor), "tremor": tremor})
+    found = result(
+        components={"relaxation": 0.7 * (1 - tremor), "floor": 0.3 * (1 - tremor), "tremor": tremor}
+    )
     ax = plot.components(found, log=log)
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     parts = [label for label in labels if label.endswith(" % of power")]
-    assert [part.partition(",")[0] for part in parts] == ["floor", "relaxation", "tremor (all bins)"]
+    assert [part.partition(",")[0] for part in parts] == [
+        "floor",
+        "relaxation",
+        "tremor (all bins)",
+    ]
     if log:
         total = np.sum([np.nan_to_num(named(ax, part).get_ydata()) for part in parts], axis=0)
     else:
-        last = ax.collections[-1].get_paths()[0].vertices  # of the areas upon each other the uppermost
+        # of the areas upon each other the uppermost
+        last = ax.collections[-1].get_paths()[0].vertices
         total = np.array([last[np.isclose(last[:, 0], x), 1].max() for x in f])
     np.testing.assert_allclose(total, found.fitted, rtol=1e-12)
     np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
     held = [found.components[part.partition(",")[0].removesuffix(" (all bins)")] for part in parts]
     shares = [100 * np.sum(found.fitted * share) for share in held]
-    assert parts == [f"{part.partition(',')[0]}, {share:.0f} % of power" for part, share in zip(parts, shares, strict=True)]
+    assert parts == [
+        f"{part.partition(',')[0]}, {share:.0f} % of power"
+        for part, share in zip(parts, shares, strict=True)
+    ]
 
 
 def test_components_that_are_not_known_are_refused():
@@ -599,11 +738,15 @@ def cohort_of(people=6, bins=30, name="p", groups="ab"):
     for i in range(people):
         count = 30 if i < people - 1 else bins
         target, power = f"{name}{i}", np.exp(0.2 * rng.standard_normal(count))
-        results[target] = types.SimpleNamespace(target=Target(target, power, bins=range(1, count + 1), segments=[6]))
+        results[target] = types.SimpleNamespace(
+            target=Target(target, power, bins=range(1, count + 1), segments=[6])
+        )
         about = {"target": target, "group": groups[i % len(groups)], "mvc_fraction": None}
-        rows += [about | {"quantity": "corner_frequency", "value": 1.0 + i, "stderr": 0.1, "unit": "Hz"},
-                 about | {"quantity": "band_0.5_1", "value": 0.1 * i, "stderr": 0.01, "unit": "1"},
-                 about | {"quantity": "k_w", "value": 1.0, "stderr": None, "unit": "N/m^3"}]  # fmt: skip
+        rows += [
+            about | {"quantity": "corner_frequency", "value": 1.0 + i, "stderr": 0.1, "unit": "Hz"},
+            about | {"quantity": "band_0.5_1", "value": 0.1 * i, "stderr": 0.01, "unit": "1"},
+            about | {"quantity": "k_w", "value": 1.0, "stderr": None, "unit": "N/m^3"},
+        ]
     named = {each: groups[i % len(groups)] for i, each in enumerate(results)}
     return types.SimpleNamespace(results=results, groups=named, table=lambda: rows)
 
@@ -618,13 +761,17 @@ def test_groups_have_a_mean_spectrum_and_their_numbers():
     last = spectra.collections[-1].get_paths()[0].vertices
     edges = [[f(last[np.isclose(last[:, 0], x), 1]) for x in F] for f in (np.min, np.max)]
     np.testing.assert_allclose(edges, mean.get_ydata() * np.exp([[-1], [1]] * error), rtol=1e-9)
-    assert corner.get_ylabel() == "corner frequency\n(Hz)" and share.get_ylabel().replace("\n", " ") == (
-        "power, 0.5 to 1\N{NO-BREAK SPACE}Hz (ratio)"
+    assert (
+        corner.get_ylabel() == "corner frequency\n(Hz)"
+        and share.get_ylabel().replace("\n", " ") == "power, 0.5 to 1\N{NO-BREAK SPACE}Hz (ratio)"
     )
     values = [line.get_ydata() for container in corner.containers for line in container.lines[:1]]
     np.testing.assert_array_equal(values, [[1, 3, 5], [2, 4, 6]])
     means = [
-        segment[0][1] for lines in corner.collections for segment in lines.get_segments() if len(set(segment[:, 1])) == 1
+        segment[0][1]
+        for lines in corner.collections
+        for segment in lines.get_segments()
+        if len(set(segment[:, 1])) == 1
     ]
     assert {3.0, 4.0} <= set(means)
     assert len(plot.groups(cohort_of(bins=20)).axes) == 2  # spectra of different bins have no mean
@@ -632,14 +779,26 @@ def test_groups_have_a_mean_spectrum_and_their_numbers():
         plot.groups(found, quantities=["k_w"])
 
 
-CELLS = ["young adults, rested", "older adults, rested", "young adults, fatigued", "older adults, fatigued"]
+CELLS = [
+    "young adults, rested",
+    "older adults, rested",
+    "young adults, fatigued",
+    "older adults, fatigued",
+]
 
 
 def studied():
-    """A study of three conditions, as far as its figure reads it; one person was not measured in the first."""
-    conditions, people = ["low force", "high force", "low force, with the eyes closed"], cohort_of(12, groups=CELLS[:2])
-    cells = [types.SimpleNamespace(target=result.target, group=people.groups[name], condition=condition)
-             for name, result in people.results.items() for condition in conditions][1:]  # fmt: skip
+    """A study of three conditions, as far as its figure reads it; one person was not measured in
+    the first."""
+    conditions, people = (
+        ["low force", "high force", "low force, with the eyes closed"],
+        cohort_of(12, groups=CELLS[:2]),
+    )
+    cells = [
+        types.SimpleNamespace(target=result.target, group=people.groups[name], condition=condition)
+        for name, result in people.results.items()
+        for condition in conditions
+    ][1:]
     return types.SimpleNamespace(cells=cells, groups=CELLS[:2], conditions=conditions)
 
 
@@ -647,17 +806,23 @@ def test_a_study_has_one_key_that_lies_outside_all_spectra():
     figure = plot.study(studied())
     figure.canvas.draw()
     (key,) = figure.legends
-    assert [t.get_text() for t in key.get_texts()] == [f"{CELLS[0]} (5 to 6 people)", f"{CELLS[1]} (6 people)"]
+    assert [t.get_text() for t in key.get_texts()] == [
+        f"{CELLS[0]} (5 to 6 people)",
+        f"{CELLS[1]} (6 people)",
+    ]
     assert not any(key.get_window_extent().overlaps(ax.get_window_extent()) for ax in figure.axes)
-    assert [bool(ax.get_xlabel()) for ax in figure.axes] == [False, True, True]  # what stands lowest in its column
+    # what stands lowest in its column
+    assert [bool(ax.get_xlabel()) for ax in figure.axes] == [False, True, True]
 
 
 @pytest.mark.slow
 def test_a_dollar_in_a_name_is_no_mathematics():
     groups = ["$x_1$ at rest", "b"]
     people = cohort_of(groups=groups, name="$p$")
-    cells = [types.SimpleNamespace(target=result.target, group=people.groups[name], condition="all")
-             for name, result in people.results.items()]  # fmt: skip
+    cells = [
+        types.SimpleNamespace(target=result.target, group=people.groups[name], condition="all")
+        for name, result in people.results.items()
+    ]
     study = types.SimpleNamespace(cells=cells, groups=groups, conditions=["all"])
     short = cohort_of(groups=["$a$", "b"])
     for figure in (
@@ -683,23 +848,45 @@ def test_long_names_do_not_take_the_height_of_the_panels():
 def words_of(figure):
     """Every text that is drawn: labels of ticks outside the axes are not."""
     yield from (text for each in (figure, *figure.subfigs) for text in each.texts)
-    yield from (text for legend in figure.findobj(matplotlib.legend.Legend) for text in legend.get_texts())
+    yield from (
+        text for legend in figure.findobj(matplotlib.legend.Legend) for text in legend.get_texts()
+    )
     for ax in figure.axes:
-        yield from (ax.title, ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label, *ax.texts)
+        yield from (
+            ax.title,
+            ax._left_title,
+            ax._right_title,
+            ax.xaxis.label,
+            ax.yaxis.label,
+            *ax.texts,
+        )
         for axis in (ax.xaxis, ax.yaxis):
             low, high = sorted(axis.get_view_interval())
-            yield from (tick.label1 for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high)
+            yield from (
+                tick.label1 for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high
+            )
 
 
 def small_words(figure):
-    """What is smaller than 6 points where the figure is 85 mm wide, leaves the figure, or overlaps something else."""
+    """What is smaller than 6 points where the figure is 85 mm wide, leaves the figure, or overlaps
+    something else."""
     figure.canvas.draw()
     width, height = figure.canvas.get_width_height()
     texts = [text for text in words_of(figure) if text.get_text().strip() and text.get_visible()]
     boxes = [(text.get_text(), text.get_window_extent().shrunk(0.98, 0.8)) for text in texts]
-    small = [text.get_text() for text in texts if text.get_fontsize() * 85 / 25.4 / figure.get_figwidth() < 6.0]
-    out = [word for word, box in boxes if box.x0 < -1 or box.x1 > width + 1 or box.y0 < -1 or box.y1 > height + 1]
-    touch = [(a, b) for i, (a, one) in enumerate(boxes) for b, other in boxes[:i] if one.overlaps(other)]
+    small = [
+        text.get_text()
+        for text in texts
+        if text.get_fontsize() * 85 / 25.4 / figure.get_figwidth() < 6.0
+    ]
+    out = [
+        word
+        for word, box in boxes
+        if box.x0 < -1 or box.x1 > width + 1 or box.y0 < -1 or box.y1 > height + 1
+    ]
+    touch = [
+        (a, b) for i, (a, one) in enumerate(boxes) for b, other in boxes[:i] if one.overlaps(other)
+    ]
     return small, out, touch
 
 
@@ -707,32 +894,65 @@ def designed():
     """A motion with the errors of the usual quantities, as far as its figure reads it."""
     told, f, time = ["K_w0", "K_z0", "C_w0", "C_z0"], np.linspace(0.1, 5, 50), np.arange(3000) / 50
     lines = types.SimpleNamespace(power=np.linspace(1e-7, 1e-10, 50), seconds=60.0)
-    errors = [dict(zip(told, 100.0 * np.array([0.81, 0.36, 0.044, 0.0083]) / k, strict=True)) for k in (1, 5, 9)]
+    errors = [
+        dict(zip(told, 100.0 * np.array([0.81, 0.36, 0.044, 0.0083]) / k, strict=True))
+        for k in (1, 5, 9)
+    ]
     return types.SimpleNamespace(
-        told=told, frequency=f, time=time, displacement=1e-3 * np.sin(time), even=lines, lengthening=lines, now=errors[0],
-        flat=errors[1], stderr=errors[2], percent=lambda name, known: known[name],
-        moves=((0.1, 1.0, 0.9),), needed=(0.05, 40.0),
-    )  # fmt: skip
+        told=told,
+        frequency=f,
+        time=time,
+        displacement=1e-3 * np.sin(time),
+        even=lines,
+        lengthening=lines,
+        now=errors[0],
+        flat=errors[1],
+        stderr=errors[2],
+        percent=lambda name, known: known[name],
+        moves=((0.1, 1.0, 0.9),),
+        needed=(0.05, 40.0),
+    )
 
 
 def identified():
-    """A report of the bundled measurements, two of them together; two directions now are far too small to be drawn."""
-    told = ["harmonic_frequency", "K_w0", "half_power_frequency", "coefficient_of_variation", "high_frequency_floor"]
-    names = ["the mean force, known to 2 %", "60 s with the insertion moved by 0.1 mm rms to 10 Hz", "a second force level"]
+    """A report of the bundled measurements, two of them together; two directions now are far too
+    small to be drawn."""
+    told = [
+        "harmonic_frequency",
+        "K_w0",
+        "half_power_frequency",
+        "coefficient_of_variation",
+        "high_frequency_floor",
+    ]
+    names = [
+        "the mean force, known to 2 %",
+        "60 s with the insertion moved by 0.1 mm rms to 10 Hz",
+        "a second force level",
+    ]
     size = np.array([300.0, 20.0, 4.0, 1.5, 0.02, 1e-7, 1e-9])
 
     def outlook(name, factor):
-        known = {t: types.SimpleNamespace(left=0.1 * k, determined=k < 3, percent=f"{0.98 + k:.2f} %") for k, t in
-                 enumerate(told)}  # fmt: skip
-        return types.SimpleNamespace(name=name, failed=None, singular_values=size * factor, quantities=known)
+        known = {
+            t: types.SimpleNamespace(left=0.1 * k, determined=k < 3, percent=f"{0.98 + k:.2f} %")
+            for k, t in enumerate(told)
+        }
+        return types.SimpleNamespace(
+            name=name, failed=None, singular_values=size * factor, quantities=known
+        )
 
     designs = [outlook(name, 10.0**i) for i, name in enumerate(names)]
     return types.SimpleNamespace(
-        target="vastus-lateralis-26mvc", designs=designs, present=outlook("now", 1.0), together=" and ", told=told,
+        target="vastus-lateralis-26mvc",
+        designs=designs,
+        present=outlook("now", 1.0),
+        together=" and ",
+        told=told,
         open_in_fit=(),
-        telling_pairs=[outlook(f"{names[0]} and {names[1]}", 1e9)], letter=lambda i: "ABC"[i], threshold=3.0,
+        telling_pairs=[outlook(f"{names[0]} and {names[1]}", 1e9)],
+        letter=lambda i: "ABC"[i],
+        threshold=3.0,
         doubt="The fit does not describe its data",
-    )  # fmt: skip
+    )
 
 
 def judged(points=0):
@@ -744,28 +964,42 @@ def judged(points=0):
         "largest": rng.gamma(20, 0.1, 999),
     }
     part = types.SimpleNamespace(
-        target=aim, residual=np.resize([0.5, -1.5, 2.5, -0.5], 30), residuals=rng.normal(size=(999, 30)),
-        reference=reference, observed={"chi2_per_bin": 1.18, "runs": 14, "largest": 2.37}, foretold=True,
+        target=aim,
+        residual=np.resize([0.5, -1.5, 2.5, -0.5], 30),
+        residuals=rng.normal(size=(999, 30)),
+        reference=reference,
+        observed={"chi2_per_bin": 1.18, "runs": 14, "largest": 2.37},
+        foretold=True,
         p_values={"chi2_per_bin": 0.0791, "runs": 0.66, "largest": 0.0251, "all": 0.0412},
-        stiffness_residual=np.resize([0.5 + 1j, -2.5 + 1j], points), stiffness_residuals=np.zeros((999, points), complex),
-    )  # fmt: skip
+        stiffness_residual=np.resize([0.5 + 1j, -2.5 + 1j], points),
+        stiffness_residuals=np.zeros((999, points), complex),
+    )
     if points:
         known = types.SimpleNamespace(frequency=np.geomspace(0.1, 10, points))
         part.target = types.SimpleNamespace(
             name=aim.name, frequency=aim.frequency, stiffness=types.SimpleNamespace(known=known)
         )
-        part.stiffness_residuals = rng.normal(size=(999, points)) + 1j * rng.normal(size=(999, points))
+        part.stiffness_residuals = rng.normal(size=(999, points)) + 1j * rng.normal(
+            size=(999, points)
+        )
         part.observed |= {"chi2_per_point": 2.4, "largest_point": 2.7}
-        reference |= {"chi2_per_point": rng.gamma(20, 0.05, 999), "largest_point": rng.gamma(30, 0.08, 999)}
+        reference |= {
+            "chi2_per_point": rng.gamma(20, 0.05, 999),
+            "largest_point": rng.gamma(30, 0.08, 999),
+        }
         part.p_values |= {"chi2_per_point": 0.001, "largest_point": 0.2}
     return types.SimpleNamespace(parts={"a": part})
 
 
-def refitted(names=("corner_frequency", "high_frequency_floor", "coefficient_of_variation", "band_0.5_1")):
+def refitted(
+    names=("corner_frequency", "high_frequency_floor", "coefficient_of_variation", "band_0.5_1"),
+):
     """Fifty refits that scatter as stated."""
     values = 1.0 + 0.1 * scipy.stats.norm.ppf((np.arange(50) + 0.5) / 50)
     each = {name: Recovery(name, "1", 1.0, 0.1, values, np.full(50, 0.1)) for name in names}
-    return types.SimpleNamespace(target="vastus-lateralis-26mvc", quantities=each, replicates=51, failed={3: "no"})
+    return types.SimpleNamespace(
+        target="vastus-lateralis-26mvc", quantities=each, replicates=51, failed={3: "no"}
+    )
 
 
 @pytest.mark.slow
@@ -788,12 +1022,32 @@ def refitted(names=("corner_frequency", "high_frequency_floor", "coefficient_of_
         lambda: plot.goodness(judged(points=40)),
         lambda: plot.bootstrap(refitted()),
         lambda: plot.static(static_characteristics(Isometric()))[0].figure,
-        lambda: plot.coverage({"corner_frequency": np.arange(20), "k_w": np.arange(20)}, draws=19).figure,
+        lambda: (
+            plot.coverage(
+                {"corner_frequency": np.arange(20), "k_w": np.arange(20)}, draws=19
+            ).figure
+        ),
     ],
-    ids=["simulation", "fit", "components", "groups", "long groups", "unlike bins", "cohort", "cells", "study",
-         "steadiness", "designed_input", "identifiability", "goodness", "goodness of a response", "bootstrap", "static",
-         "coverage"],
-)  # fmt: skip
+    ids=[
+        "simulation",
+        "fit",
+        "components",
+        "groups",
+        "long groups",
+        "unlike bins",
+        "cohort",
+        "cells",
+        "study",
+        "steadiness",
+        "designed_input",
+        "identifiability",
+        "goodness",
+        "goodness of a response",
+        "bootstrap",
+        "static",
+        "coverage",
+    ],
+)
 def test_words_are_legible_in_a_column_of_a_journal_and_do_not_touch(draw):
     assert small_words(draw()) == ([], [], [])
 
@@ -802,16 +1056,21 @@ def test_words_are_legible_in_a_column_of_a_journal_and_do_not_touch(draw):
 @pytest.mark.parametrize("power", [1.0, 1e-6], ids=["fractions", "small"])
 @pytest.mark.parametrize("draw", [plot.spectrum, plot.target, plot.fit, plot.components])
 def test_no_number_of_a_logarithmic_axis_has_a_small_exponent(draw, power):
-    """Mathematics and raised digits are drawn at 0.7 of the letters or less: 4.3 points in a column of 85 mm."""
+    """Mathematics and raised digits are drawn at 0.7 of the letters or less: 4.3 points in a column
+    of 85 mm."""
     if draw is plot.spectrum:
-        figure = draw(Spectrum(F, power * 1e-3 / (1 + F**2) ** 2, SETTINGS, "N"), log=True, proportional=False).figure
+        figure = draw(
+            Spectrum(F, power * 1e-3 / (1 + F**2) ** 2, SETTINGS, "N"), log=True, proportional=False
+        ).figure
     elif draw is plot.target:
         figure = draw(Target("t", power + 1 / (1 + F**2), segments=12), log=True).figure
     else:
         figure = draw(result()) if draw is plot.fit else draw(result(), log=True).figure
     figure.canvas.draw()
     numbers = []
-    for axis in (axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis) if axis.get_scale() == "log"):
+    for axis in (
+        axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis) if axis.get_scale() == "log"
+    ):
         low, high = sorted(axis.get_view_interval())
         ticks = [*axis.get_major_ticks(), *axis.get_minor_ticks()]
         numbers.append([tick.label1.get_text() for tick in ticks if low <= tick.get_loc() <= high])
@@ -822,7 +1081,12 @@ def test_no_number_of_a_logarithmic_axis_has_a_small_exponent(draw, power):
 
 def test_numbers_of_axes():
     values = (20.0, 0.0005, 5e-5, 2e6)
-    assert [_plot_numbers.number_in_print(v) for v in values] == ["20", "0.0005", "5e\N{MINUS SIGN}5", "2e6"]
+    assert [_plot_numbers.number_in_print(v) for v in values] == [
+        "20",
+        "0.0005",
+        "5e\N{MINUS SIGN}5",
+        "2e6",
+    ]
 
 
 def test_small_singular_values_are_counted_and_the_legend_says_so():
@@ -852,18 +1116,24 @@ def test_points_of_a_target_stand_out_and_its_band_does_not_on_a_white_and_on_a_
 def share(ax, name, level):
     """The drawn share of simulations whose interval of that credibility holds the truth."""
     line = named(ax, name)
-    return float(line.get_ydata()[np.searchsorted(line.get_xdata(), level + 1e-9, side="right") - 1])
+    return float(
+        line.get_ydata()[np.searchsorted(line.get_xdata(), level + 1e-9, side="right") - 1]
+    )
 
 
-@pytest.mark.parametrize(("scale", "name"), [(1.0, "right"), (0.5, "too narrow"), (2.0, "too wide")])
+@pytest.mark.parametrize(
+    ("scale", "name"), [(1.0, "right"), (0.5, "too narrow"), (2.0, "too wide")]
+)
 def test_the_coverage_of_normal_posteriors_is_that_of_their_closed_form(scale, name):
-    """Errors N(0, 1) under posteriors of standard deviation `scale`: C(α) = 2 Φ(scale Φ⁻¹((1 + α)/2)) - 1."""
+    """Errors N(0, 1) under posteriors of standard deviation `scale`: C(α) = 2 Φ(scale Φ⁻¹((1 +
+    α)/2)) - 1."""
     count = 2000
     off = scipy.stats.norm.ppf((np.arange(count) + 0.5) / count)
     ax = plot.coverage({name: scipy.stats.norm.cdf(off / scale)})
     for level in (0.25, 0.5, 0.9):
         expected = 2 * scipy.stats.norm.cdf(scale * scipy.stats.norm.ppf((1 + level) / 2)) - 1
-        assert share(ax, name, level) == pytest.approx(expected, abs=3 / count)  # a step of the curve is 2 / count
+        # a step of the curve is 2 / count
+        assert share(ax, name, level) == pytest.approx(expected, abs=3 / count)
     assert ax.get_xlim() == ax.get_ylim() == (0, 1) and ax.get_xlabel() and ax.get_ylabel()
 
 
@@ -887,16 +1157,23 @@ def test_the_band_holds_calibrated_shares_as_often_as_it_says():
     rng = np.random.default_rng(6)
     ax = plot.coverage({"k_w": rng.uniform(size=100)}, level=0.9)
     low, high = band_at(ax, 0.3)
-    inside = np.mean([low <= np.mean(np.abs(2 * u - 1) <= 0.3) <= high for u in rng.uniform(size=(4000, 100))])
-    # Whole counts: at least 90 %, and at most the two counts at its ends more; 4 standard errors of 4000.
+    inside = np.mean(
+        [low <= np.mean(np.abs(2 * u - 1) <= 0.3) <= high for u in rng.uniform(size=(4000, 100))]
+    )
+    # Whole counts: at least 90 %, and at most the two counts at its ends more; 4 standard errors
+    # of 4000.
     assert 0.9 - 4 * 0.005 < inside < 0.9 + 0.07
 
 
 @pytest.mark.parametrize(
     ("ranks", "draws", "message"),
-    [({}, None, "ranks: is empty"), ({"k_w": [0, 11]}, 10, r"ranks\['k_w'\]: must lie between 0 and 10 \(of 10 draws"),
-     ({"k_w": [3]}, None, "without draws= they are shares"), ({"k_w": [[0]]}, 1, r"has shape \(1, 1\)")],
-)  # fmt: skip
+    [
+        ({}, None, "ranks: is empty"),
+        ({"k_w": [0, 11]}, 10, r"ranks\['k_w'\]: must lie between 0 and 10 \(of 10 draws"),
+        ({"k_w": [3]}, None, "without draws= they are shares"),
+        ({"k_w": [[0]]}, 1, r"has shape \(1, 1\)"),
+    ],
+)
 def test_ranks_that_are_none_are_refused(ranks, draws, message):
     with pytest.raises(ValueError, match=message):
         plot.coverage(ranks, draws)
@@ -908,23 +1185,43 @@ def test_a_bootstrap_draws_the_coverage_of_its_own_intervals():
     quantities = refitted().quantities
     found = Bootstrap("mine", {}, dict(quantities), 50, {}, "simulated", 0)
     ax = found.plot_coverage()
-    assert [line.get_label() for line in ax.lines[1:]] == [n.replace("_", " ") for n in quantities if "band" not in n]
+    assert [line.get_label() for line in ax.lines[1:]] == [
+        n.replace("_", " ") for n in quantities if "band" not in n
+    ]
     near, known = quantities["corner_frequency"].inside
     assert share(ax, "corner frequency", 0.95) == near / known
 
 
 def test_several_profiles_share_a_figure_and_a_legend():
     values = np.linspace(0.5, 1.5, 21)
-    common = {"threshold": 3.84, "level": 0.95, "intervals": [(0.8, 1.2)], "value": 1.0, "stderr": 0.1, "unit": "Hz",
-              "target": "mine", "low": 0.8, "high": 1.2}  # fmt: skip
+    common = {
+        "threshold": 3.84,
+        "level": 0.95,
+        "intervals": [(0.8, 1.2)],
+        "value": 1.0,
+        "stderr": 0.1,
+        "unit": "Hz",
+        "target": "mine",
+        "low": 0.8,
+        "high": 1.2,
+    }
     each = [
-        types.SimpleNamespace(values=values, rise=k * (values - 1) ** 2, name=f"n{k}", **common) for k in (100, 50, 25, 12)
+        types.SimpleNamespace(values=values, rise=k * (values - 1) ** 2, name=f"n{k}", **common)
+        for k in (100, 50, 25, 12)
     ]
     figure = plot.profiles(each)
     figure.canvas.draw()
-    assert [ax.get_xlabel() for ax in figure.axes] == ["n100 (Hz)", "n50 (Hz)", "n25 (Hz)", "n12 (Hz)"]
+    assert [ax.get_xlabel() for ax in figure.axes] == [
+        "n100 (Hz)",
+        "n50 (Hz)",
+        "n25 (Hz)",
+        "n12 (Hz)",
+    ]
     assert all(ax.get_ylabel() for ax in figure.axes)
-    assert key(figure) == ["profile", "95 % threshold", "95 % interval", "by curvature"] and figure.get_suptitle() == "mine"
+    assert (
+        key(figure) == ["profile", "95 % threshold", "95 % interval", "by curvature"]
+        and figure.get_suptitle() == "mine"
+    )
     for ax, found in zip(figure.axes, each, strict=True):
         np.testing.assert_array_equal(named(ax, "profile").get_ydata(), found.rise)
     with pytest.raises(ValueError, match="profiles: is empty"):
@@ -941,9 +1238,12 @@ def test_a_figure_is_written_in_the_formats_asked_for_the_same_each_time(tmp_pat
         ax.set_title("title")
         return write_figure(figure, tmp_path, "figure", *formats)
 
-    assert write() == ["figure.png"] and matplotlib.image.imread(tmp_path / "figure.png").shape[:2] == (300, 600)
+    assert write() == ["figure.png"] and matplotlib.image.imread(tmp_path / "figure.png").shape[
+        :2
+    ] == (300, 600)
     assert write(["pdf", "svg", "pdf"]) == ["figure.pdf", "figure.svg"]
-    assert {file.name for file in tmp_path.iterdir()} == {"figure.pdf", "figure.svg"}  # that of before is gone
+    # that of before is gone
+    assert {file.name for file in tmp_path.iterdir()} == {"figure.pdf", "figure.svg"}
     once = [(tmp_path / name).read_bytes() for name in ("figure.pdf", "figure.svg")]
     assert once[0].startswith(b"%PDF") and b"<svg" in once[1]
     with pytest.raises(ValueError, match=r"'jpg' is no format of a figure.*Known: png, pdf, svg"):
@@ -957,8 +1257,13 @@ def test_pixels_that_are_drawn_already_are_not_drawn_again(tmp_path):
     drawn = pixels_of(figure)
     write_figure(figure, tmp_path, "plain")
     assert (tmp_path / "plain.png").read_bytes() == drawn  # the same figure, whoever draws it
-    assert write_figure(figure, tmp_path, "given", ["png", "svg"], pixels=b"given") == ["given.png", "given.svg"]
-    assert (tmp_path / "given.png").read_bytes() == b"given" and b"<svg" in (tmp_path / "given.svg").read_bytes()
+    assert write_figure(figure, tmp_path, "given", ["png", "svg"], pixels=b"given") == [
+        "given.png",
+        "given.svg",
+    ]
+    assert (tmp_path / "given.png").read_bytes() == b"given" and b"<svg" in (
+        tmp_path / "given.svg"
+    ).read_bytes()
 
 
 # --- the drawing of the model
@@ -987,15 +1292,18 @@ def test_the_drawing_tells_what_a_task_prescribes_and_what_comes_out(task, given
     symbols = {"P_w": r"$P_\mathrm{w}$", "F_ext": r"$F_\mathrm{ext}$", "x_z": r"$x_\mathrm{z}$"}
     words = written(plot.schematic(task, values=False))
     assert {name for name, symbol in symbols.items() if symbol in words[plot.BLUE]} == given
-    assert [name for name, symbol in symbols.items() if symbol in words[plot.VERMILLION]] == [output]
+    assert [name for name, symbol in symbols.items() if symbol in words[plot.VERMILLION]] == [
+        output
+    ]
     held = isinstance(task, Isometric)
-    assert ("M" in words[plot.BLUE]) == ("x_z" in given and not held)  # a motor, where the insertion moves
+    # a motor, where the insertion moves
+    assert ("M" in words[plot.BLUE]) == ("x_z" in given and not held)
 
 
 def test_the_drawing_has_the_numbers_of_the_task():
     task = PrescribedForce(
         P_w=7.0, F_ext=2.5, noise=BandLimitedNoise() + ResonantNoise(0.01, frequency=9.0)
-    ).replace(m_w=0.25, k_w=1e6, c_z=8.0, noise_C_w=0.0, activation_time=0.08)  # fmt: skip
+    ).replace(m_w=0.25, k_w=1e6, c_z=8.0, noise_C_w=0.0, activation_time=0.08)
     said = [text.get_text() for text in plot.schematic(task).texts]
     for words in (
         ("K_", "400 N/m"),
@@ -1008,24 +1316,38 @@ def test_the_drawing_has_the_numbers_of_the_task():
         assert any(all(word in text for word in words) for text in said), words
     assert {"0.25 kg", "0.5 kg", "2.5 N"} <= set(said) and said.count("noise 0.01 %") == 1
     assert any("sine 0.3 % at 4.25 Hz" in text for text in said)
-    assert not any("sine" in text.get_text() for text in plot.schematic(task.replace(harmonic_amplitude=0.0)).texts)
+    assert not any(
+        "sine" in text.get_text()
+        for text in plot.schematic(task.replace(harmonic_amplitude=0.0)).texts
+    )
 
 
 def drawn_fit(**changes):
     """A fit as far as its drawing reads it."""
     derived = {
-        "K_w0": estimate(184.2, "N/m", 13.0), "K_z0": estimate(314.0, "N/m", identifiable=False),
-        "C_w0": estimate(114.3, "N s/m", 8.0), "C_z0": estimate(1.79, "N s/m", 0.12), "mean": estimate(2.92, "N", 0.2),
-    } | changes  # fmt: skip
-    parameters = {"noise_K_w": estimate(0.269, "1", 0.019), "harmonic_amplitude": estimate(0.00325, "1", 0.00023)}
-    return types.SimpleNamespace(tasks={"a": Isometric()}, parameters=parameters, derived=derived, as_shown=dict)
+        "K_w0": estimate(184.2, "N/m", 13.0),
+        "K_z0": estimate(314.0, "N/m", identifiable=False),
+        "C_w0": estimate(114.3, "N s/m", 8.0),
+        "C_z0": estimate(1.79, "N s/m", 0.12),
+        "mean": estimate(2.92, "N", 0.2),
+    } | changes
+    parameters = {
+        "noise_K_w": estimate(0.269, "1", 0.019),
+        "harmonic_amplitude": estimate(0.00325, "1", 0.00023),
+    }
+    return types.SimpleNamespace(
+        tasks={"a": Isometric()}, parameters=parameters, derived=derived, as_shown=dict
+    )
 
 
 def test_the_drawing_of_a_fit_has_errors_and_marks_what_is_not_determined():
     ax = plot.schematic(drawn_fit())
     said = [text.get_text() for text in ax.texts]
     assert any("184 ± 13 N/m" in text for text in said) and "noise 26.9 ± 1.9 %" in said
-    assert [text for text in said if "†" in text] == [r"$K_\mathrm{z0}$  314 N/m †", "† not determined by the data"]
+    assert [text for text in said if "†" in text] == [
+        r"$K_\mathrm{z0}$  314 N/m †",
+        "† not determined by the data",
+    ]
     assert {"2.92", "± 0.20 N"} <= set(said)
     known = plot.schematic(drawn_fit(K_z0=estimate(314.0, "N/m", 22.0)))
     assert not any("†" in text.get_text() for text in known.texts)
@@ -1044,6 +1366,8 @@ def test_words_of_the_drawing_lie_in_a_column_of_a_journal_and_do_not_touch(valu
     figure.canvas.draw()
     width, height = figure.canvas.get_width_height()
     boxes = [text.get_window_extent() for text in ax.texts if text.get_text()]
-    assert all(box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height for box in boxes)
+    assert all(
+        box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height for box in boxes
+    )
     assert not any(a.shrunk(0.98, 0.6).overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
     assert min(text.get_fontsize() for text in ax.texts if text.get_text()) > 6

@@ -1,4 +1,5 @@
-"""Simulated noise responses against closed forms: spectra of a linear oscillator, means under damping noise."""
+"""Simulated noise responses against closed forms: spectra of a linear oscillator, means under
+damping noise."""
 
 import functools
 
@@ -31,30 +32,47 @@ def linear_muscle(stiffness=K, c_w=C_W, c_z=C_Z):
 def oscillator(noise):
     rest = FORCE / (2 * K)
     still = jm.Harmonic(0.0)
-    return jm.Isometric(jm.model.Constant(FORCE), muscle=linear_muscle(), noise=noise, harmonic=still, initial=(rest, 0.0))
+    return jm.Isometric(
+        jm.model.Constant(FORCE),
+        muscle=linear_muscle(),
+        noise=noise,
+        harmonic=still,
+        initial=(rest, 0.0),
+    )
 
 
 def response(f, noise):
-    """Density of F_ext: what N_Kw and N_Kz do to m x'' + C x' + K x = P at its equilibrium x, seen at the sensor."""
+    """Density of F_ext: what N_Kw and N_Kz do to m x'' + C x' + K x = P at its equilibrium x, seen
+    at the sensor."""
     s, rest = 2j * np.pi * f, FORCE / (2 * K)
     passive = (C_Z * s + K) / (MASS * s**2 + (C_W + C_Z) * s + 2 * K)
     amplitude = np.asarray(noise.amplitude) * K
-    gains = (amplitude[0] * rest * np.abs(passive)) ** 2 + (amplitude[1] * rest * np.abs(1 - passive)) ** 2
+    gains = (amplitude[0] * rest * np.abs(passive)) ** 2 + (
+        amplitude[1] * rest * np.abs(1 - passive)
+    ) ** 2
     match noise:
         case jm.WhiteNoise():
             return gains / noise.rate
         case jm.BandLimitedNoise():
             return gains / noise.rate / (1 + (f / noise.cutoff) ** 4)
         case jm.OrnsteinUhlenbeckNoise():
-            return gains * 2 * noise.correlation_time / (1 + (2 * np.pi * f * noise.correlation_time) ** 2)
+            return (
+                gains
+                * 2
+                * noise.correlation_time
+                / (1 + (2 * np.pi * f * noise.correlation_time) ** 2)
+            )
 
 
 def halved(path):
     """The same path on the grid of twice the step."""
     pick = lambda x: None if x is None else x[..., ::2, :]  # noqa: E731
     increments = path.increments
-    return Realisation(pick(path.values), pick(path.slopes),
-                       None if increments is None else increments[..., ::2, :] + increments[..., 1::2, :])  # fmt: skip
+    return Realisation(
+        pick(path.values),
+        pick(path.slopes),
+        None if increments is None else increments[..., ::2, :] + increments[..., 1::2, :],
+    )
 
 
 SMALL = 2e-3  # second order effects of this noise are 1e-5 of its power
@@ -79,15 +97,17 @@ def test_spectrum_of_a_linear_oscillator(x64, noise):
     # Hann bins three apart are independent.
     references.assert_standard_normal((power.mean(axis=0) - expected) / error, every=3)
 
-    # The step's bias, by halving it with the same noise: 4/3 of the difference, Heun's mean being of order two here. So
-    # many seeds have it to a twentieth of the error above.
+    # The step's bias, by halving it with the same noise: 4/3 of the difference, Heun's mean being
+    # of order two here. So many seeds have it to a twentieth of the error above.
     seeds = 128 if isinstance(noise, jm.WhiteNoise) else 32
 
     def spectra(key):
         fine = task.noise.realise(task.noise.draw(key, 30_000), 5e-4)
         pairs = (fine, Grid(5e-4, 30_000, 20)), (halved(fine), Grid(1e-3, 15_000, 10))
         outputs = [respond(task, path, grid, "instant")[1] for path, grid in pairs]
-        return [jm.spectra.spectrum_of(output, task.settings, (5.0, 15.0)).power for output in outputs]
+        return [
+            jm.spectra.spectrum_of(output, task.settings, (5.0, 15.0)).power for output in outputs
+        ]
 
     fine, coarse = map(np.asarray, at_once(jax.vmap(spectra), jax.random.split(KEY, seeds)))
     bias = 4 / 3 * np.abs(np.mean(coarse - fine, axis=0))
@@ -98,16 +118,20 @@ RATE, DIFFUSION = 20.0, 4.0  # C/m [1/s], and density of the noise of C/m [1/s]
 
 
 def sliding(noise_of, mean):
-    """`v' = P/m - (λ + n) v`: a mass in a viscous medium with noisy viscosity, pulled to v = 1 without noise."""
+    """`v' = P/m - (λ + n) v`: a mass in a viscous medium with noisy viscosity, pulled to v = 1
+    without noise."""
     amplitude = np.sqrt(DIFFUSION) / RATE  # of C_w0, per √Hz
     noise = noise_of({"C_w": amplitude * 10.0}, rate=100.0)
     muscle = linear_muscle(0.0, c_w=RATE * MASS, c_z=0.0)
     pull = jm.model.Constant(RATE * MASS)
-    return jm.PrescribedForce(pull, noise=noise, muscle=muscle, harmonic=jm.Harmonic(0.0), initial=(0, mean, 0, 0))
+    return jm.PrescribedForce(
+        pull, noise=noise, muscle=muscle, harmonic=jm.Harmonic(0.0), initial=(0, mean, 0, 0)
+    )
 
 
 def mean_velocity(task, dt, seeds=256):
-    """Mean and standard error over seeds of the velocity, after it has forgotten its start (e^{-18})."""
+    """Mean and standard error over seeds of the velocity, after it has forgotten its start
+    (e^{-18})."""
     runs = jm.ensemble(task, KEY, seeds=seeds, duration=6.0, dt=dt, substeps=1)
     means = np.asarray(runs.state("v_w"))[:, 101:].mean(axis=1)
     return means.mean(), means.std(ddof=1) / np.sqrt(seeds)
@@ -115,9 +139,11 @@ def mean_velocity(task, dt, seeds=256):
 
 @pytest.mark.slow
 def test_white_damping_noise_is_stratonovich(x64):
-    """`dv = λ (1 - v) dt - √D v ∘ dW` has the mean λ / (λ - D/2); in the sense of Itô it would be 1."""
+    """`dv = λ (1 - v) dt - √D v ∘ dW` has the mean λ / (λ - D/2); in the sense of Itô it would be
+    1."""
     expected = RATE / (RATE - DIFFUSION / 2)
-    # Heun's mean decays by 1 - λh + Dh/2 + (λh)²/2 per step: a bias of h (λ² - (λ - D/2)²) / 2 (λ - D/2).
+    # Heun's mean decays by 1 - λh + Dh/2 + (λh)²/2 per step: a bias of h (λ² - (λ - D/2)²) / 2 (λ -
+    # D/2).
     dt = 2.5e-4
     mean, error = mean_velocity(sliding(jm.WhiteNoise, expected), dt)
     bias = dt * (RATE**2 - (RATE - DIFFUSION / 2) ** 2) / (2 * (RATE - DIFFUSION / 2))
@@ -127,7 +153,8 @@ def test_white_damping_noise_is_stratonovich(x64):
 
 
 def coloured_mean(cutoff):
-    """E v = λ ∫ exp(-λ τ + Var(∫_0^τ n) / 2) dτ, exact for Gaussian n; Var = 2 ∫ (τ - r) R(r) dr."""
+    """E v = λ ∫ exp(-λ τ + Var(∫_0^τ n) / 2) dτ, exact for Gaussian n; Var = 2 ∫ (τ - r) R(r)
+    dr."""
     w = 2 * np.pi * cutoff
     tau = np.linspace(0.0, 2.0, 40_001)
     a = w * tau / np.sqrt(2)
@@ -143,7 +170,9 @@ def test_white_noise_is_the_limit_of_band_limited_noise(x64):
     distance, standard = [], []
     for cutoff, dt in ((2.0, 5e-4), (10.0, 5e-4), (100.0, 5e-4)):
         expected = coloured_mean(cutoff)
-        mean, error = mean_velocity(sliding(functools.partial(jm.BandLimitedNoise, cutoff=cutoff), expected), dt)
+        mean, error = mean_velocity(
+            sliding(functools.partial(jm.BandLimitedNoise, cutoff=cutoff), expected), dt
+        )
         standard.append((mean - expected) / error)
         distance.append(abs(mean - limit))
     references.assert_standard_normal(standard)

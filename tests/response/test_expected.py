@@ -1,4 +1,5 @@
-"""The expected spectrum: against quadrature of hand-derived transfer functions, scipy, simulation; derivatives, errors."""
+"""The expected spectrum: against quadrature of hand-derived transfer functions, scipy, simulation;
+derivatives, errors."""
 
 import functools
 import sys
@@ -20,7 +21,13 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model import Constant, Decay, RampHold
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._autocovariance import Autocovariance
-from jaxmuscle.response._expected import covariance_operator, expected_moments, expected_powers, lags_of, linear_spectrum
+from jaxmuscle.response._expected import (
+    covariance_operator,
+    expected_moments,
+    expected_powers,
+    lags_of,
+    linear_spectrum,
+)
 from jaxmuscle.response._harmonic_line import _ordinates, line_table
 from jaxmuscle.response._linearised import check_equilibrium, has_response, linearised
 from jaxmuscle.response._transfer import system_of, transfer
@@ -48,7 +55,8 @@ def active(p, x):
 
 
 def isometric(p, s):
-    """Responses of F_ext to N_Kw, N_Kz and P_w by equation (1a) with x_z held, and F_ext at rest."""
+    """Responses of F_ext to N_Kw, N_Kz and P_w by equation (1a) with x_z held, and F_ext at
+    rest."""
     held = p["x_z"]
     K_z = coefficients(p, 0.0, held)[1]
     x = root(lambda x: active(p, x) + K_z * (x - held) - p["P_w"])
@@ -58,7 +66,8 @@ def isometric(p, s):
 
 
 def prescribed_force(p, s):
-    """Responses of x_z by (1a) and (1b), solved by Cramer's rule; K_z at x_z as printed, so its tangent is not K_z."""
+    """Responses of x_z by (1a) and (1b), solved by Cramer's rule; K_z at x_z as printed, so its
+    tangent is not K_z."""
     x_w = root(lambda x: active(p, x) + p["F_ext"] - p["P_w"])
     x_z = root(lambda z: coefficients(p, x_w, z)[1] * (z - x_w) + p["F_ext"])
     K_w, K_z, C_w, C_z = coefficients(p, x_w, x_z)
@@ -66,7 +75,12 @@ def prescribed_force(p, s):
     inner, link = p["m_w"] * s**2 + (C_w + C_z) * s + K_w + K_z, C_z * s + K_z
     outer, back = p["m_z"] * s**2 + C_z * s + tangent, C_z * s + tangent
     determinant = inner * outer - back * link
-    return -link * x_w / determinant, (x_z - x_w) * (link - inner) / determinant, link / determinant, x_z
+    return (
+        -link * x_w / determinant,
+        (x_z - x_w) * (link - inner) / determinant,
+        link / determinant,
+        x_z,
+    )
 
 
 def prescribed_motion(p, s):
@@ -84,7 +98,12 @@ def acceleration(p, s):
     return *(s**2 * H for H in moved), 0.0
 
 
-RESPONSES = {"F_ext": isometric, "x_z": prescribed_force, "a_z": acceleration, "P_w": prescribed_motion}
+RESPONSES = {
+    "F_ext": isometric,
+    "x_z": prescribed_force,
+    "a_z": acceleration,
+    "P_w": prescribed_motion,
+}
 
 
 def stiffness(p):
@@ -92,7 +111,8 @@ def stiffness(p):
 
 
 def replies(task, p, f):
-    """Of the output to a relative change of K_w, K_z, C_w, C_z and P_w; at rest damping does nothing."""
+    """Of the output to a relative change of K_w, K_z, C_w, C_z and P_w; at rest damping does
+    nothing."""
     s = 2j * np.pi * f
     H_w, H_z, H_P, _ = RESPONSES[task.output_name](p, s)
     (K_w, K_z), twitch = stiffness(p), 1 / (1 + s * p.get("activation_time", 0.0)) ** 2
@@ -107,7 +127,12 @@ def shape(noise, f):
         case jm.BandLimitedNoise():
             return 1 / noise.rate / (1 + (f / noise.cutoff) ** 4)
         case jm.ResonantNoise():
-            return noise.width / np.pi * f**2 / ((noise.frequency**2 - f**2) ** 2 + noise.width**2 * f**2)
+            return (
+                noise.width
+                / np.pi
+                * f**2
+                / ((noise.frequency**2 - f**2) ** 2 + noise.width**2 * f**2)
+            )
         case _:
             tau = noise.correlation_time
             return 2 * tau / (1 + (2 * np.pi * f * tau) ** 2)
@@ -131,7 +156,8 @@ REACH = 100
 
 
 def sampled(density, rate, f):
-    """Density of the sampled signal, the aliases beyond REACH as the integral over their power law."""
+    """Density of the sampled signal, the aliases beyond REACH as the integral over their power
+    law."""
     total = references.aliased(density, rate, f, REACH)
     for sign in (-1, 1):
         near, far = f + sign * (REACH + 1) * rate, f + 2 * sign * (REACH + 1) * rate
@@ -139,18 +165,25 @@ def sampled(density, rate, f):
         at_near, at_far = density(near), density(far)
         seen = at_near > 0
         power = np.log(at_near[seen] / at_far[seen]) / np.log(far[seen] / near[seen])
-        total[seen] += at_near[seen] * (np.abs(near[seen]) / edge[seen]) ** power * edge[seen] / ((power - 1) * rate)
+        total[seen] += (
+            at_near[seen]
+            * (np.abs(near[seen]) / edge[seen]) ** power
+            * edge[seen]
+            / ((power - 1) * rate)
+        )
     return total
 
 
 def against_aliases(settings, f, finer):
-    """Frequency response of the low-pass of `scipy.signal.resample_poly`, from a rate so many times that of the samples."""
+    """Frequency response of the low-pass of `scipy.signal.resample_poly`, from a rate so many times
+    that of the samples."""
     taps = scipy.signal.firwin(20 * finer + 1, 1 / finer, window=("kaiser", 5.0))
     return scipy.signal.freqz(taps, worN=np.abs(f), fs=finer * settings.rate)[1]
 
 
 def filtered(density, settings, f, finer=FINER, *, aliases=True):
-    """Density of samples low-passed before: of a signal known at so many times the rate, or at all times (no `aliases`)."""
+    """Density of samples low-passed before: of a signal known at so many times the rate, or at all
+    times (no `aliases`)."""
     total = np.zeros(len(f))
     for shifted in (f + k * settings.rate for k in range(-finer // 2, finer // 2)):
         before = sampled(density, finer * settings.rate, shifted) if aliases else density(shifted)
@@ -158,8 +191,8 @@ def filtered(density, settings, f, finer=FINER, *, aliases=True):
     return total
 
 
-# The rest is a midpoint rule for Σ m^-2 from REACH on, which is 1 / 12 REACH³ = 8e-8 of the aliases, themselves at most
-# ten times what lies below half the sampling rate.
+# The rest is a midpoint rule for Σ m^-2 from REACH on, which is 1 / 12 REACH³ = 8e-8 of the
+# aliases, themselves at most ten times what lies below half the sampling rate.
 ALIASES = 1e-6
 
 
@@ -167,28 +200,40 @@ def detrended(x, settings):
     """Along the first axis, for complex segments, too."""
     if settings.detrend == "none":
         return x
-    return sum(f * scipy.signal.detrend(part, 0, settings.detrend) for f, part in ((1, x.real), (1j, x.imag)))
+    return sum(
+        f * scipy.signal.detrend(part, 0, settings.detrend)
+        for f, part in ((1, x.real), (1j, x.imag))
+    )
 
 
 def low_pass(settings, f):
     if settings.filter_cutoff is None:
         return np.ones_like(f, dtype=complex)
-    sos = scipy.signal.butter(settings.filter_order, settings.filter_cutoff, fs=settings.rate, output="sos")
+    sos = scipy.signal.butter(
+        settings.filter_order, settings.filter_cutoff, fs=settings.rate, output="sos"
+    )
     gain = scipy.signal.sosfreqz(sos, f, fs=settings.rate)[1]
     return np.abs(gain) ** 2 if settings.filter_direction == "both" else gain
 
 
 def tapers_by_scipy(settings):
     if settings.window == "dpss":
-        return scipy.signal.windows.dpss(settings.length, (settings.tapers + 1) / 2, settings.tapers)
+        return scipy.signal.windows.dpss(
+            settings.length, (settings.tapers + 1) / 2, settings.tapers
+        )
     return [scipy.signal.get_window(settings.window, settings.length)]
 
 
 def welch_by_scipy(x, settings):
     """Along the first axis."""
-    cut = {"noverlap": settings.length - settings.step, "detrend": False if settings.detrend == "none" else settings.detrend}
+    cut = {
+        "noverlap": settings.length - settings.step,
+        "detrend": False if settings.detrend == "none" else settings.detrend,
+    }
     tapers = tapers_by_scipy(settings)
-    power = np.mean([scipy.signal.welch(x, settings.rate, taper, **cut, axis=0)[1] for taper in tapers], axis=0)
+    power = np.mean(
+        [scipy.signal.welch(x, settings.rate, taper, **cut, axis=0)[1] for taper in tapers], axis=0
+    )
     return power[settings.first_bin : settings.last_bin + 1]
 
 
@@ -196,12 +241,19 @@ def line_by_scipy(task, settings, window):
     """Welch power and variance of the harmonic's steady response as a time series."""
     p = {name: float(value) for name, value in task.parameters.items()}
     f = np.array([p["harmonic_frequency"]])
-    reply = replies(task, p, f)[:2].sum(axis=0) * p["harmonic_amplitude"] * np.exp(1j * p["harmonic_phase"])
+    reply = (
+        replies(task, p, f)[:2].sum(axis=0)
+        * p["harmonic_amplitude"]
+        * np.exp(1j * p["harmonic_phase"])
+    )
     if settings.sampling == "average":
         reply = reply * np.sinc(f / settings.rate) * np.exp(-1j * np.pi * f / settings.rate)
     if settings.sampling == "filtered":
         reply = reply * np.abs(against_aliases(settings, f, FINER))
-    time = np.arange(round(window[0] * settings.rate), round(window[1] * settings.rate)) / settings.rate
+    time = (
+        np.arange(round(window[0] * settings.rate), round(window[1] * settings.rate))
+        / settings.rate
+    )
     turning = np.exp(2j * np.pi * f * time)
     seen = (reply * low_pass(settings, f) * turning).imag
     return welch_by_scipy(seen, settings), np.var(seen)
@@ -210,18 +262,27 @@ def line_by_scipy(task, settings, window):
 def by_quadrature(task, settings, window, points=4096):
     """Noise, line, mean and variance, all written from the equations.
 
-    Every integrand is periodic in f, so equally spaced points integrate it to what is left of the autocovariance after
-    `points` samples.
+    Every integrand is periodic in f, so equally spaced points integrate it to what is left of the
+    autocovariance after `points` samples.
     """
     p = {name: float(value) for name, value in task.parameters.items()}
     f = (np.arange(points) / points - 0.5) * settings.rate
     before = functools.partial(density, task, p, settings)
-    S = filtered(before, settings, f) if settings.sampling == "filtered" else sampled(before, settings.rate, f)
+    S = (
+        filtered(before, settings, f)
+        if settings.sampling == "filtered"
+        else sampled(before, settings.rate, f)
+    )
     S = S * np.abs(low_pass(settings, np.abs(f))) ** 2
     bins, m = np.arange(settings.first_bin, settings.last_bin + 1), np.arange(settings.length)
-    tapers, turns = tapers_by_scipy(settings), np.exp(-2j * np.pi * np.outer(bins, m) / settings.length)
+    tapers, turns = (
+        tapers_by_scipy(settings),
+        np.exp(-2j * np.pi * np.outer(bins, m) / settings.length),
+    )
     waves = detrended(np.exp(2j * np.pi * np.outer(m, f) / settings.rate), settings)
-    kernel = np.mean([np.abs((turns * taper) @ waves) ** 2 / np.sum(taper**2) for taper in tapers], axis=0)
+    kernel = np.mean(
+        [np.abs((turns * taper) @ waves) ** 2 / np.sum(taper**2) for taper in tapers], axis=0
+    )
     sides = np.where((bins == 0) | (2 * bins == settings.length), 1.0, 2.0) / settings.rate
     noise = sides * (kernel @ S) * settings.rate / points
     line, swing = line_by_scipy(task, settings, window)
@@ -238,17 +299,29 @@ ALONE = {"K_w": 0.15}
 RHYTHM = jm.Harmonic(0.003, 4.25, 0.7)
 CASES = {
     "isometric, band-limited": (jm.Isometric, jm.BandLimitedNoise(BOTH), {}),
-    "isometric, OU": (jm.Isometric, jm.OrnsteinUhlenbeckNoise(BOTH, 0.05), {"filter_direction": "both", "first_bin": 0}),
+    "isometric, OU": (
+        jm.Isometric,
+        jm.OrnsteinUhlenbeckNoise(BOTH, 0.05),
+        {"filter_direction": "both", "first_bin": 0},
+    ),
     "isometric, slow": (jm.Isometric, jm.OrnsteinUhlenbeckNoise(BOTH, 0.3), SLOW),
     "isometric, multitaper": (jm.Isometric, jm.OrnsteinUhlenbeckNoise(BOTH, 0.3), MULTITAPER),
-    "isometric, white": (jm.Isometric, jm.WhiteNoise(ALONE), {"detrend": "none", "filter_cutoff": None, "last_bin": 128}),
+    "isometric, white": (
+        jm.Isometric,
+        jm.WhiteNoise(ALONE),
+        {"detrend": "none", "filter_cutoff": None, "last_bin": 128},
+    ),
     "force, band-limited": (jm.PrescribedForce, jm.BandLimitedNoise(BOTH), {}),
     "force, shared OU": (
         jm.PrescribedForce,
         jm.OrnsteinUhlenbeckNoise(BOTH, shared=True),
         {"rate": 200.0, "length": 100, "sampling": "average"},
     ),
-    "force, white": (jm.PrescribedForce, jm.WhiteNoise(BOTH), {"window": "hamming", "overlap": 0.3}),
+    "force, white": (
+        jm.PrescribedForce,
+        jm.WhiteNoise(BOTH),
+        {"window": "hamming", "overlap": 0.3},
+    ),
     "isometric, filtered": (
         jm.Isometric,
         jm.OrnsteinUhlenbeckNoise(BOTH, 0.05),
@@ -266,7 +339,11 @@ CASES = {
         {"filter_direction": "both", "detrend": "linear", "sampling": "average"},
     ),
 }
-INPUTS = {jm.Isometric: (5.0, 0.003), jm.PrescribedForce: (5.0, 1.0), jm.PrescribedMotion: (0.004, 6.0)}
+INPUTS = {
+    jm.Isometric: (5.0, 0.003),
+    jm.PrescribedForce: (5.0, 1.0),
+    jm.PrescribedMotion: (0.004, 6.0),
+}
 
 
 FAST = ("isometric, band-limited", "isometric, OU", "force, shared OU", "motion, band-limited")
@@ -287,26 +364,46 @@ def test_closed_form_is_the_quadrature_of_the_transfer_functions(x64, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("sampling", ["instant", "average", "filtered"])
 def test_acceleration_in_closed_form_is_the_quadrature(x64, sampling):
-    """Of noise on all that moves it: band-limited, resonant on the drive, the active part slowed."""
+    """Of noise on all that moves it: band-limited, resonant on the drive, the active part
+    slowed."""
     noise = jm.BandLimitedNoise((0.15, 0.05, 0.0, 0.0, 0.02)) + jm.ResonantNoise(0.05)
-    task = jm.PrescribedForce(5.0, 1.0, noise=noise, harmonic=RHYTHM, activation=jm.Activation(0.06), observe="acceleration")
+    task = jm.PrescribedForce(
+        5.0,
+        1.0,
+        noise=noise,
+        harmonic=RHYTHM,
+        activation=jm.Activation(0.06),
+        observe="acceleration",
+    )
     assert_as_by_quadrature(task, Settings(sampling=sampling), WINDOW)
 
 
 def filtered_and_not(task, settings, window):
-    return (expected_moments(as_arrays(task), settings.replace(sampling=s), window)[0] for s in ("filtered", "instant"))
+    return (
+        expected_moments(as_arrays(task), settings.replace(sampling=s), window)[0]
+        for s in ("filtered", "instant")
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise, rest", [(jm.BandLimitedNoise(BOTH), 1e-4), (jm.OrnsteinUhlenbeckNoise(BOTH, 0.05), 1e-3)])
-def test_what_is_filtered_is_a_recording_of_a_signal_known_at_all_times(x64, monkeypatch, noise, rest):
-    """But for aliases from 742 Hz on, which 800 Hz has: 3e-5 of a bin where noise falls fast, 7e-4 where it does not.
+@pytest.mark.parametrize(
+    "noise, rest",
+    [(jm.BandLimitedNoise(BOTH), 1e-4), (jm.OrnsteinUhlenbeckNoise(BOTH, 0.05), 1e-3)],
+)
+def test_what_is_filtered_is_a_recording_of_a_signal_known_at_all_times(
+    x64, monkeypatch, noise, rest
+):
+    """But for aliases from 742 Hz on, which 800 Hz has: 3e-5 of a bin where noise falls fast, 7e-4
+    where it does not.
 
     At the sampling instants aliases are a twentieth of a bin and more.
     """
     known = functools.partial(filtered, finer=64, aliases=False)
     monkeypatch.setattr(sys.modules[__name__], "filtered", known)
-    task, settings = jm.Isometric(5.0, 0.003, noise=noise), Settings(filter_direction="both", sampling="filtered")
+    task, settings = (
+        jm.Isometric(5.0, 0.003, noise=noise),
+        Settings(filter_direction="both", sampling="filtered"),
+    )
     task = task.replace(harmonic_amplitude=0.0)
     expected, _, _, variance = by_quadrature(task, settings, WINDOW)
     found, instant = filtered_and_not(task, settings, WINDOW)
@@ -326,25 +423,36 @@ def test_the_transfer_function_of_acceleration_is_that_of_displacement_twice_dif
 @functools.cache
 def replies_of_both():
     """Of displacement and acceleration to noise of K_w, K_z and P_w each: a program."""
-    tasks = [jm.PrescribedForce(5.0, 1.0, observe=what) for what in ("displacement", "acceleration")]
-    systems = [[system_of(t, linearised(t).system, jnp.asarray(base)) for t in tasks] for base in np.eye(5)[[0, 1, 4]]]
-    return kept_jit(lambda omega: [[transfer(system, omega) for system in pair] for pair in systems])
+    tasks = [
+        jm.PrescribedForce(5.0, 1.0, observe=what) for what in ("displacement", "acceleration")
+    ]
+    systems = [
+        [system_of(t, linearised(t).system, jnp.asarray(base)) for t in tasks]
+        for base in np.eye(5)[[0, 1, 4]]
+    ]
+    return kept_jit(
+        lambda omega: [[transfer(system, omega) for system in pair] for pair in systems]
+    )
 
 
 def assert_as_by_quadrature(task, settings, window):
     moments, _ = expected_moments(as_arrays(task), settings, window)
     noise, line, mean, variance = by_quadrature(task, settings, window)
     np.testing.assert_allclose(moments.power, noise + line, rtol=ALIASES)
-    np.testing.assert_allclose(moments.line, line, rtol=1e-8, atol=1e-12 * line.max())  # rounding, of the peak far from it
+    # rounding, of the peak far from it
+    np.testing.assert_allclose(moments.line, line, rtol=1e-8, atol=1e-12 * line.max())
     # The mean of an acceleration is the rounding of forces of a few newtons.
-    np.testing.assert_allclose(moments.mean, mean, rtol=1e-10, atol=1e-12 if task.quantity == "acceleration" else 0.0)
+    np.testing.assert_allclose(
+        moments.mean, mean, rtol=1e-10, atol=1e-12 if task.quantity == "acceleration" else 0.0
+    )
     np.testing.assert_allclose(moments.variance, variance, rtol=ALIASES)
 
 
 @pytest.mark.parametrize("frequency", [0.07, 0.31, 2.2])
 @pytest.mark.parametrize("direction", ["forward", "both"])
 def test_the_variance_of_a_line_is_that_of_its_samples(x64, frequency, direction):
-    """Of fractions of a period, too: a sine in time, low-passed by scipy, its variance about the mean of the samples."""
+    """Of fractions of a period, too: a sine in time, low-passed by scipy, its variance about the
+    mean of the samples."""
     settings, reply = Settings().replace(filter_direction=direction), 1.3 * np.exp(0.4j)
     begin, samples, ahead = 5.0, 1000, 4000
     time = np.arange(-ahead, round(begin * settings.rate) + samples + ahead) / settings.rate
@@ -361,19 +469,26 @@ def test_the_variance_of_a_line_is_that_of_its_samples(x64, frequency, direction
 @functools.cache
 def variance_of_a_line(settings, window, samples):
     """Of any frequency and reply: a program."""
-    return kept_jit(lambda frequency, reply: line_table(settings, window, frequency, samples).variance(reply))
+    return kept_jit(
+        lambda frequency, reply: line_table(settings, window, frequency, samples).variance(reply)
+    )
 
 
 @pytest.mark.slow
 def test_the_variance_is_that_of_so_many_samples(x64):
-    """A minute after 5 s, as a window or as samples from the begin of a shorter one; more slow noise is in it."""
-    task = jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise(BOTH, 2.0), harmonic=jm.Harmonic(0.003, 0.07, 0.7))
+    """A minute after 5 s, as a window or as samples from the begin of a shorter one; more slow
+    noise is in it."""
+    task = jm.Isometric(
+        noise=jm.OrnsteinUhlenbeckNoise(BOTH, 2.0), harmonic=jm.Harmonic(0.003, 0.07, 0.7)
+    )
     whole, begun, short = (
         expected_moments(as_arrays(task), task.settings, window, samples)[0]
         for window, samples in (((5.0, 65.0), None), ((5.0, 15.0), 6000), ((5.0, 15.0), None))
     )
     np.testing.assert_allclose(begun.variance, whole.variance, rtol=1e-12)
-    np.testing.assert_allclose(whole.variance, by_quadrature(task, task.settings, (5.0, 65.0), 2**14)[3], rtol=ALIASES)
+    np.testing.assert_allclose(
+        whole.variance, by_quadrature(task, task.settings, (5.0, 65.0), 2**14)[3], rtol=ALIASES
+    )
     assert short.variance < 0.98 * whole.variance
     np.testing.assert_array_equal(begun.power, short.power)
 
@@ -381,10 +496,16 @@ def test_the_variance_is_that_of_so_many_samples(x64):
 @pytest.mark.slow
 @pytest.mark.parametrize("phase", [0.0, np.pi / 2])
 def test_phase_of_a_slow_harmonic(x64, phase):
-    """At 0.5 Hz the leakage from negative frequencies depends on the phase; a segment starts it anew."""
+    """At 0.5 Hz the leakage from negative frequencies depends on the phase; a segment starts it
+    anew."""
     kind, noise, changes = CASES["isometric, OU"]
-    task = references.quiet(kind(*INPUTS[kind], noise=noise), harmonic_amplitude=1e-5, harmonic_frequency=0.5)
-    settings, tasks = Settings().replace(**changes), [task.replace(harmonic_phase=p) for p in (phase, phase + np.pi / 2)]
+    task = references.quiet(
+        kind(*INPUTS[kind], noise=noise), harmonic_amplitude=1e-5, harmonic_frequency=0.5
+    )
+    settings, tasks = (
+        Settings().replace(**changes),
+        [task.replace(harmonic_phase=p) for p in (phase, phase + np.pi / 2)],
+    )
     here, other = (np.asarray(jm.expected_spectrum(t, settings, SHIFTED).power) for t in tasks)
     np.testing.assert_allclose(here, line_by_scipy(tasks[0], settings, SHIFTED)[0], rtol=1e-8)
     assert np.all(np.abs(other / here - 1)[here < 1e-3 * here.max()] > 0.05)
@@ -392,14 +513,19 @@ def test_phase_of_a_slow_harmonic(x64, phase):
 
 ENVELOPES = {
     "isometric": (jm.Isometric, jm.Harmonic(1e-5, 4.25, 0.7, Decay(1.0, 0.2, 5.0, 3.0)), {}),
-    "force": (jm.PrescribedForce, jm.Harmonic(1e-5, 4.25, 0.7, RampHold(1.0, 6.0, 4.0, 0.5, 0.1)), {}),
+    "force": (
+        jm.PrescribedForce,
+        jm.Harmonic(1e-5, 4.25, 0.7, RampHold(1.0, 6.0, 4.0, 0.5, 0.1)),
+        {},
+    ),
     "motion": (
         jm.PrescribedMotion,
         jm.Harmonic(1e-5, 4.25, 0.7, Decay(1.0, 0.2, 5.0, 3.0)),
         {"sampling": "average"},
     ),
 }
-# An average over the interval before a sample lags by half of it: Δ a' / 2 a of the amplitude, a' / a = 0.2/s at most.
+# An average over the interval before a sample lags by half of it: Δ a' / 2 a of the amplitude, a' /
+# a = 0.2/s at most.
 LAG = {"motion": 2e-3}
 
 
@@ -407,21 +533,27 @@ LAG = {"motion": 2e-3}
 @pytest.mark.slow
 def test_line_is_the_spectrum_of_a_noise_free_simulation(x64, name):
     kind, harmonic, changes = ENVELOPES[name]
-    task = references.quiet(kind(*INPUTS[kind], harmonic=harmonic, settings=Settings().replace(**changes)))
+    task = references.quiet(
+        kind(*INPUTS[kind], harmonic=harmonic, settings=Settings().replace(**changes))
+    )
     power = np.asarray(jm.simulate(jm.settled(task), KEY, dt=5e-4, substeps=1).spectrum().power)
-    # Heun's relative error of a response, (|λ| dt)² / 6 with |λ| <= 120/s; the closed form joins the envelope's samples
-    # by lines, Δ² a'' / 8 = 1e-5 of its size.
+    # Heun's relative error of a response, (|λ| dt)² / 6 with |λ| <= 120/s; the closed form joins
+    # the envelope's samples by lines, Δ² a'' / 8 = 1e-5 of its size.
     expected = linear_spectrum(task, task.settings).power
-    np.testing.assert_allclose(expected, power, rtol=6e-4 + LAG.get(name, 0.0), atol=1e-6 * power.max())
+    np.testing.assert_allclose(
+        expected, power, rtol=6e-4 + LAG.get(name, 0.0), atol=1e-6 * power.max()
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("c_w", [60.0, 6000.0])  # the slow one has not forgotten by 5 s where it started from
+# the slow one has not forgotten by 5 s where it started from
+@pytest.mark.parametrize("c_w", [60.0, 6000.0])
 def test_an_envelope_that_does_not_change_is_a_constant_one(x64, c_w):
     task = references.quiet(jm.Isometric(5.0, 0.003, c_w=c_w))
     still = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, Constant(0.5)))
     decayed = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, Decay(0.5, 0.5)))
-    # The low-pass starts at t = 0 in one and long before in the other: by 5 s that is forgotten, to rounding.
+    # The low-pass starts at t = 0 in one and long before in the other: by 5 s that is forgotten, to
+    # rounding.
     a, b = (jm.expected_spectrum(t).power for t in (still, decayed))
     np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-13 * np.max(a))
 
@@ -433,7 +565,11 @@ def test_constant_covariance_is_detrended_away():
         assert np.abs(operator.sum(axis=1)).max() < 1e-12 * np.abs(operator).sum(axis=1).max()
     operator = covariance_operator(Settings(detrend="none", first_bin=0, filter_cutoff=None))[:-2]
     taper = scipy.signal.get_window("hann", 256)
-    leak = np.abs(np.fft.rfft(taper)[:31]) ** 2 * np.r_[1.0, np.full(30, 2.0)] / (100.0 * np.sum(taper**2))
+    leak = (
+        np.abs(np.fft.rfft(taper)[:31]) ** 2
+        * np.r_[1.0, np.full(30, 2.0)]
+        / (100.0 * np.sum(taper**2))
+    )
     np.testing.assert_allclose(operator.sum(axis=1), leak, atol=1e-12 * leak.max())
 
 
@@ -448,8 +584,21 @@ RINGING = np.exp(-np.arange(2000) / 20) * np.cos(np.arange(2000) / 3)
         {},
         {"detrend": "linear", "filter_direction": "both"},
         {"detrend": "none", "first_bin": 0, "filter_cutoff": None},
-        {"window": "boxcar", "filter_order": 4, "filter_cutoff": 10.0, "length": 100, "last_bin": 50},
-        {"window": "hamming", "filter_order": 2, "filter_direction": "both", "rate": 250.0, "length": 75, "first_bin": 0},
+        {
+            "window": "boxcar",
+            "filter_order": 4,
+            "filter_cutoff": 10.0,
+            "length": 100,
+            "last_bin": 50,
+        },
+        {
+            "window": "hamming",
+            "filter_order": 2,
+            "filter_direction": "both",
+            "rate": 250.0,
+            "length": 75,
+            "first_bin": 0,
+        },
         SLOW,
         MULTITAPER,
     ],
@@ -457,12 +606,15 @@ RINGING = np.exp(-np.arange(2000) / 20) * np.cos(np.arange(2000) / 3)
 )
 @pytest.mark.parametrize("covariance", [WHITE, RINGING], ids=["white", "ringing"])
 def test_covariance_operator_is_scipys_expectation(changes, covariance):
-    """x = L e has the covariance L Lᵀ, and its expected power is the sum of the powers of the columns of L."""
+    """x = L e has the covariance L Lᵀ, and its expected power is the sum of the powers of the
+    columns of L."""
     settings, edge = Settings().replace(**changes), 400
     samples = settings.length + 2 * edge
     columns = scipy.linalg.cholesky(scipy.linalg.toeplitz(covariance[:samples]), lower=True)
     if settings.filter_cutoff is not None:
-        sos = scipy.signal.butter(settings.filter_order, settings.filter_cutoff, fs=settings.rate, output="sos")
+        sos = scipy.signal.butter(
+            settings.filter_order, settings.filter_cutoff, fs=settings.rate, output="sos"
+        )
         columns = scipy.signal.sosfilt(sos, columns, axis=0)
         if settings.filter_direction == "both":
             columns = scipy.signal.sosfilt(sos, columns[::-1], axis=0)[::-1]
@@ -474,25 +626,33 @@ def test_covariance_operator_is_scipys_expectation(changes, covariance):
     np.testing.assert_allclose(power, expected, rtol=1e-10)
     lag, n = np.arange(1, settings.length), settings.length
     of_mean = (covariance[0] + 2 * (1 - lag / n) @ covariance[1:n]) / n
-    # That the covariance has decayed at the last lag: in 75 and 100 samples it has, to 2 %, over n².
+    # That the covariance has decayed at the last lag: in 75 and 100 samples it has, to 2 %, over
+    # n².
     variance = columns[edge:-edge].var(axis=0).sum()
-    np.testing.assert_allclose(passed - of_mean + lowered / n**2, variance, rtol=1e-8 if n > 200 else 1e-4)
+    np.testing.assert_allclose(
+        passed - of_mean + lowered / n**2, variance, rtol=1e-8 if n > 200 else 1e-4
+    )
 
 
 @pytest.mark.parametrize("window", ["boxcar", "hann", "dpss"])
 @pytest.mark.parametrize("detrend", ["none", "constant", "linear"])
 def test_transforms_of_long_segments_are_the_matrices(x64, window, detrend):
     changes: dict = {"tapers": 3} if window == "dpss" else {}
-    settings = Settings().replace(length=1100, first_bin=0, last_bin=550, window=window, detrend=detrend, **changes)
+    settings = Settings().replace(
+        length=1100, first_bin=0, last_bin=550, window=window, detrend=detrend, **changes
+    )
     operator = covariance_operator(settings)
     assert lags_of(settings) == operator.shape[1]
     r = RINGING[: operator.shape[1]]
     power, expected = expected_powers(settings, r), operator @ r
-    # Of bins above the low-pass, and of those that detrending removes, nothing is left but rounding.
+    # Of bins above the low-pass, and of those that detrending removes, nothing is left but
+    # rounding.
     np.testing.assert_allclose(power, expected, rtol=1e-10, atol=1e-12 * expected[:-2].max())
     x = np.cumsum(RINGING[:1100])
     found = bin_rows(settings) @ x
-    np.testing.assert_allclose(_ordinates(settings, jnp.asarray(x)), found, rtol=1e-10, atol=1e-12 * np.abs(found).max())
+    np.testing.assert_allclose(
+        _ordinates(settings, jnp.asarray(x)), found, rtol=1e-10, atol=1e-12 * np.abs(found).max()
+    )
 
 
 @pytest.mark.slow
@@ -500,26 +660,39 @@ def test_settled_tasks_rest(x64):
     for kind, inputs in INPUTS.items():
         held = jm.settled(kind(*inputs))
         slope = held.vector_field(jnp.zeros(()), held.initial_state(), jnp.zeros(4))
-        np.testing.assert_allclose(slope, 0.0, atol=1e-9)  # [1/s, m/s²]: the root find stops at 1e-12 m, A is 1e3/s² at most
+        # [1/s, m/s²]: the root find stops at 1e-12 m, A is 1e3/s² at most
+        np.testing.assert_allclose(slope, 0.0, atol=1e-9)
         assert held.parameters == kind(*inputs).parameters
     start = jax.jit(lambda P: jnp.stack(jm.settled(jm.Isometric(P)).initial))(5.0)
     np.testing.assert_allclose(start, jm.settled(jm.Isometric(5.0)).initial, rtol=1e-12)
 
 
 DIFFERENTIATED = {
-    "force": jm.PrescribedForce(5.0, 1.0, noise=jm.WhiteNoise(0.05), settings=Settings(sampling="filtered")),
-    "acceleration": jm.PrescribedForce(5.0, 1.0, noise=jm.OrnsteinUhlenbeckNoise(0.05), observe="acceleration"),
+    "force": jm.PrescribedForce(
+        5.0, 1.0, noise=jm.WhiteNoise(0.05), settings=Settings(sampling="filtered")
+    ),
+    "acceleration": jm.PrescribedForce(
+        5.0, 1.0, noise=jm.OrnsteinUhlenbeckNoise(0.05), observe="acceleration"
+    ),
     "motion": jm.PrescribedMotion(0.004, 5.0),
     "all": jm.Isometric(
         5.0,
         0.003,
-        noise=jm.BandLimitedNoise((0.1, 0.05, 0.01, 0.01, 0.02)) + jm.ResonantNoise(0.01) + jm.ResonantNoise(0.01, 3.5, 1.0),
+        noise=jm.BandLimitedNoise((0.1, 0.05, 0.01, 0.01, 0.02))
+        + jm.ResonantNoise(0.01)
+        + jm.ResonantNoise(0.01, 3.5, 1.0),
         activation=jm.Activation(0.06),
     ),
 }
-# At rest nothing moves: noise on damping has no first-order effect, nor has the mass of an insertion that is held.
+# At rest nothing moves: noise on damping has no first-order effect, nor has the mass of an
+# insertion that is held.
 SILENT = {"noise_C_w", "noise_C_z"}
-SILENT_IN = {"force": SILENT, "acceleration": SILENT, "motion": SILENT | {"m_z"}, "all": SILENT | {"m_z"}}
+SILENT_IN = {
+    "force": SILENT,
+    "acceleration": SILENT,
+    "motion": SILENT | {"m_z"},
+    "all": SILENT | {"m_z"},
+}
 
 
 @pytest.mark.slow
@@ -534,11 +707,18 @@ def test_every_derivative_forward_reverse_and_by_differences(x64, name):
         values = {name: x * s for name, x, s in zip(names, relative, scale, strict=True)}
         return jnp.log(jm.expected_spectrum(task.replace(**values)).power)
 
-    n, h = scale.size, 1e-5  # truncation h² f''' / 6, and rounding 1e-12 / h of an equilibrium found to 1e-12
-    # One program for derivatives and differences: values and slopes along a parameter, at one and a little off.
-    along, off = (np.concatenate(rows) for rows in ([np.eye(n)] * 3, [0 * np.eye(n), h * np.eye(n), -h * np.eye(n)]))
+    # truncation h² f''' / 6, and rounding 1e-12 / h of an equilibrium found to 1e-12
+    n, h = scale.size, 1e-5
+    # One program for derivatives and differences: values and slopes along a parameter, at one and a
+    # little off.
+    along, off = (
+        np.concatenate(rows)
+        for rows in ([np.eye(n)] * 3, [0 * np.eye(n), h * np.eye(n), -h * np.eye(n)])
+    )
     given = 1 + off, along
-    power, slopes = at_once(lambda *given: jax.lax.map(lambda g: jax.jvp(log_power, g[:1], g[1:]), given), *given)
+    power, slopes = at_once(
+        lambda *given: jax.lax.map(lambda g: jax.jvp(log_power, g[:1], g[1:]), given), *given
+    )
     _, ahead, behind = np.split(np.asarray(power), 3)
     forward, differences = np.asarray(slopes)[:n].T, (ahead - behind).T / (2 * h)
     # A fault of the reverse mode in any bin shows in their sum with weights at random.
@@ -548,7 +728,11 @@ def test_every_derivative_forward_reverse_and_by_differences(x64, name):
     np.testing.assert_allclose(value, weight @ power[0], rtol=1e-9)
     np.testing.assert_allclose(reverse, weight @ forward, rtol=1e-8, atol=1e-9 * largest)
     np.testing.assert_allclose(forward, differences, atol=1e-5 * largest)
-    silent = {n for n, column in zip(names, forward.T, strict=True) if np.all(np.abs(column) < 1e-9 * largest)}
+    silent = {
+        n
+        for n, column in zip(names, forward.T, strict=True)
+        if np.all(np.abs(column) < 1e-9 * largest)
+    }
     assert silent == SILENT_IN[name]
 
 
@@ -561,12 +745,17 @@ def test_gradient_by_a_natural_name_under_jit_and_vmap(x64):
 
     k_w, h = np.array([3e5, 5e5, 8e5]), 50.0
     power, slope = at_once(jax.vmap(jax.value_and_grad(last_bin)), k_w)
-    np.testing.assert_allclose(power, [last_bin(k) for k in k_w], rtol=1e-9)  # rounding, in another order of summation
-    np.testing.assert_allclose(slope, [(last_bin(k + h) - last_bin(k - h)) / (2 * h) for k in k_w], rtol=1e-6)
+    # rounding, in another order of summation
+    np.testing.assert_allclose(power, [last_bin(k) for k in k_w], rtol=1e-9)
+    np.testing.assert_allclose(
+        slope, [(last_bin(k + h) - last_bin(k - h)) / (2 * h) for k in k_w], rtol=1e-6
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some_slow(["isometric, band-limited", "force, band-limited"], ["force, band-limited"]))
+@pytest.mark.parametrize(
+    "name", some_slow(["isometric, band-limited", "force, band-limited"], ["force, band-limited"])
+)
 def test_single_precision(name):
     kind, noise, _ = CASES[name]
     task = kind(*INPUTS[kind], noise=noise, harmonic=RHYTHM)
@@ -581,7 +770,9 @@ def test_single_precision(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("samples, head", [(2, 1), (3, 1), (64, 1), (999, 1), (1000, 1), (1000, 20), (21, 20), (9, 20)])
+@pytest.mark.parametrize(
+    "samples, head", [(2, 1), (3, 1), (64, 1), (999, 1), (1000, 1), (1000, 20), (21, 20), (9, 20)]
+)
 def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples, head):
     rng = np.random.default_rng(samples)
     step = 0.99 * scipy.linalg.expm(0.3 * (rng.normal(size=(3, 3)) - 2 * np.eye(3)))
@@ -593,7 +784,9 @@ def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples, head):
     powers = jnp.stack([np.linalg.matrix_power(step, 2**k) for k in range(11)])
     r = r[:samples]
     found = Autocovariance(jnp.asarray(first), jnp.asarray(rows), powers, jnp.asarray(start))
-    lagged, variance = at_once(lambda found: (found.lagged(samples), found.mean_variance(samples)), found)
+    lagged, variance = at_once(
+        lambda found: (found.lagged(samples), found.mean_variance(samples)), found
+    )
     np.testing.assert_allclose(lagged, r, rtol=1e-12, atol=1e-13)
     lag = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
     np.testing.assert_allclose(variance, np.array(r)[lag].mean(), rtol=1e-11)
@@ -616,7 +809,8 @@ def test_a_task_from_outside_a_compiled_function():
 
 
 class Crossbridge(jm.AbstractMuscle):
-    """A user's own muscle: a cubic active and a linear passive tissue. Counts how often it is traced."""
+    """A user's own muscle: a cubic active and a linear passive tissue. Counts how often it is
+    traced."""
 
     m_w: float = 0.4
     m_z: float = 0.6
@@ -655,10 +849,23 @@ def test_one_trace_per_structure(x64, monkeypatch):
 @pytest.mark.parametrize("kind", some_slow(INPUTS, [jm.Isometric]))
 @pytest.mark.slow
 def test_a_users_own_muscle_in_closed_form(x64, kind):
-    """The same muscle out of jaxmuscle's parts: k (x_ref² + x²) with k x_ref² the stiffness and x_ref = 0.03."""
-    inner, outer = jm.model.QuadraticStiffness(300.0 / 0.03**2, 0.03), jm.model.QuadraticStiffness(200.0 / 1e8, 1e4)
-    made = jm.Muscle(0.4, 0.6, inner, outer, jm.model.QuadraticDamping(40.0, 1.0), jm.model.QuadraticDamping(5.0 / 1e8, 1e4))
-    theirs, ours = (jm.expected_spectrum(kind(*INPUTS[kind], muscle=m)) for m in (Crossbridge(), made))
+    """The same muscle out of jaxmuscle's parts: k (x_ref² + x²) with k x_ref² the stiffness and
+    x_ref = 0.03."""
+    inner, outer = (
+        jm.model.QuadraticStiffness(300.0 / 0.03**2, 0.03),
+        jm.model.QuadraticStiffness(200.0 / 1e8, 1e4),
+    )
+    made = jm.Muscle(
+        0.4,
+        0.6,
+        inner,
+        outer,
+        jm.model.QuadraticDamping(40.0, 1.0),
+        jm.model.QuadraticDamping(5.0 / 1e8, 1e4),
+    )
+    theirs, ours = (
+        jm.expected_spectrum(kind(*INPUTS[kind], muscle=m)) for m in (Crossbridge(), made)
+    )
     # x_ref = 1e4 m makes a law constant to 1e-12.
     np.testing.assert_allclose(theirs.power, ours.power, rtol=1e-8)
     assert theirs.unit == kind(*INPUTS[kind]).output_unit
@@ -676,7 +883,8 @@ SIMULATED = {
 
 @pytest.mark.slow
 def test_the_expected_coefficient_of_variation_is_that_of_simulations(x64):
-    """Its square, whose mean over seeds has a known standard error; and its slope by differences."""
+    """Its square, whose mean over seeds has a known standard error; and its slope by
+    differences."""
     task, (start, stop) = jm.settled(jm.Isometric(noise="white")), (5.0, 15.0)
     runs = jm.ensemble(task, KEY, seeds=1000, duration=stop, dt=1.25e-3, control=False)
     rate = task.settings.rate
@@ -697,27 +905,39 @@ def test_the_expected_coefficient_of_variation_is_that_of_simulations(x64):
 
 @pytest.mark.slow
 def test_the_mean_of_simulations_is_as_expected(x64):
-    z, window = [], (1.0, 6.12)  # a settled task forgets that it starts without fluctuations, by 1 s to e^-7
+    # a settled task forgets that it starts without fluctuations, by 1 s to e^-7
+    z, window = [], (1.0, 6.12)
     options = {"seeds": 1000, "duration": window[1], "dt": 1.25e-3, "substeps": 1, "control": False}
     for i, task in enumerate(SIMULATED.values()):
         runs = jm.ensemble(jm.settled(task), jax.random.fold_in(KEY, i), **options)
         power = np.asarray(runs.spectrum(window=window).power)
         expected = np.asarray(linear_spectrum(runs.task, task.settings, window).power)
-        z.append((power.mean(axis=0) - expected) / (power.std(axis=0, ddof=1) / np.sqrt(len(power))))
+        z.append(
+            (power.mean(axis=0) - expected) / (power.std(axis=0, ddof=1) / np.sqrt(len(power)))
+        )
     references.assert_standard_normal(z, every=3)
 
 
 @pytest.mark.slow
 def test_recordings_of_1_khz_are_as_expected_where_they_are_filtered(x64):
-    """Decimated by scipy: spectrum and variation are those of "filtered"; of "instant" 5 % too large, with its aliases."""
-    task, window, seeds = jm.settled(jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(BOTH))), (5.0, 14.6), 400
-    runs = jm.ensemble(task, KEY, seeds=seeds, rate=1000.0, duration=15.0, substeps=1, control=False)
+    """Decimated by scipy: spectrum and variation are those of "filtered"; of "instant" 5 % too
+    large, with its aliases."""
+    task, window, seeds = (
+        jm.settled(jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(BOTH))),
+        (5.0, 14.6),
+        400,
+    )
+    runs = jm.ensemble(
+        task, KEY, seeds=seeds, rate=1000.0, duration=15.0, substeps=1, control=False
+    )
     even = scipy.signal.resample_poly(runs.output, 1, 10, axis=1, padtype="line")
     settings = Settings(filter_direction="both", sampling="filtered")
     held = scipy.signal.sosfiltfilt(settings.sections, even)[:, 500:1460]
     power, variance = welch_by_scipy(held.T, settings).T, held.var(axis=1)
     found, instant = filtered_and_not(task, settings, window)
-    references.assert_standard_normal((power.mean(axis=0) - found.power) / (power.std(axis=0) / np.sqrt(seeds)), every=3)
+    references.assert_standard_normal(
+        (power.mean(axis=0) - found.power) / (power.std(axis=0) / np.sqrt(seeds)), every=3
+    )
     error = variance.std() / np.sqrt(seeds)
     assert abs(variance.mean() - found.variance) < 4 * error
     assert float(instant.variance) > variance.mean() + 5 * error
@@ -729,21 +949,36 @@ def test_recordings_of_1_khz_are_as_expected_where_they_are_filtered(x64):
 @pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [0.0, 0.04], ids=["noise", "mostly a line"])
 def test_the_coefficient_of_variation_of_a_recording_scatters_as_expected(x64, amplitude):
-    """Recordings of 9.6 s by the nonlinear simulator; 400 of them know their standard deviation to 3.5 %."""
+    """Recordings of 9.6 s by the nonlinear simulator; 400 of them know their standard deviation to
+    3.5 %."""
     task = jm.Isometric().replace(harmonic_amplitude=amplitude)
     runs = jm.ensemble(jm.settled(task), KEY, seeds=400, control=False)
     held = runs.filtered(window=(5.0, 14.6))
     variation = held.std(axis=1) / held.mean(axis=1)
     moments = expected_moments(as_arrays(task), task.settings, (5.0, 14.6))[0]
     assert variation.mean() == pytest.approx(float(moments.variation), rel=0.02)
-    target = jm.Target("ten seconds", np.ones(30), segments=6, coefficient_of_variation=0.01, settings=task.settings)
+    target = jm.Target(
+        "ten seconds",
+        np.ones(30),
+        segments=6,
+        coefficient_of_variation=0.01,
+        settings=task.settings,
+    )
     assert task.settings.length + 5.5 * task.settings.step == 960
     value, sd = target_variation(target, task)
     assert value == np.log(0.01)
     assert sd == pytest.approx(np.log(variation).std(), rel=0.11)
-    line = float(moments.variance) - float(expected_moments(as_arrays(quiet_line(task)), task.settings, WINDOW)[0].variance)
+    line = float(moments.variance) - float(
+        expected_moments(as_arrays(quiet_line(task)), task.settings, WINDOW)[0].variance
+    )
     assert (line / float(moments.variance) > 0.5) == (amplitude > 0)
-    several = jm.Target("trials", np.ones(30), segments=(6,) * 4, coefficient_of_variation=0.01, settings=task.settings)
+    several = jm.Target(
+        "trials",
+        np.ones(30),
+        segments=(6,) * 4,
+        coefficient_of_variation=0.01,
+        settings=task.settings,
+    )
     assert target_variation(several, task)[1] == pytest.approx(sd / 2)
 
 
@@ -752,21 +987,30 @@ def quiet_line(task):
 
 
 def snapped(P_w=41.57, F_ext=7.0):
-    """A passive spring K_z(x_z) that softens faster than it is let go: started at its unstable equilibrium."""
+    """A passive spring K_z(x_z) that softens faster than it is let go: started at its unstable
+    equilibrium."""
     p = {name: float(value) for name, value in jm.PrescribedForce(P_w, F_ext).parameters.items()}
     x_w = root(lambda x: active(p, x) + F_ext - P_w)
-    x_z = scipy.optimize.brentq(lambda z: coefficients(p, x_w, z)[1] * (z - x_w) + F_ext, 0.008, 0.016)
+    x_z = scipy.optimize.brentq(
+        lambda z: coefficients(p, x_w, z)[1] * (z - x_w) + F_ext, 0.008, 0.016
+    )
     return jm.PrescribedForce(P_w, F_ext, initial=(x_w, 0.0, x_z, 0.0))
 
 
 LITERAL = {"x_ref_w": 0.0, "x_ref_z": 0.0, "v_ref_w": 0.0, "v_ref_z": 0.0}
 REFUSED = {
-    "unstable": (snapped(), r"equilibrium of this PrescribedForce is unstable: eigenvalues .* 1/s at \["),
+    "unstable": (
+        snapped(),
+        r"equilibrium of this PrescribedForce is unstable: eigenvalues .* 1/s at \[",
+    ),
     "literal force": (
         jm.PrescribedForce(5.0, 1.0).replace(**LITERAL),
         r"PrescribedForce is undamped: eigenvalues .*v_ref_w",
     ),
-    "literal isometric": (jm.Isometric(5.0, 0.003).replace(**LITERAL), "Isometric is undamped: eigenvalues"),
+    "literal isometric": (
+        jm.Isometric(5.0, 0.003).replace(**LITERAL),
+        "Isometric is undamped: eigenvalues",
+    ),
     "no damping": (jm.Isometric().replace(c_w=0.0, c_z=0.0), "Isometric is undamped"),
     "no stiffness": (
         jm.PrescribedForce().replace(k_w=0.0),
@@ -788,7 +1032,8 @@ def test_what_has_no_linear_response(x64, name):
 
 
 def test_an_undamped_motion_beside_a_fast_decay_is_told_from_rounding():
-    # ± 1i/s beside -1e5/s: rounding gives the oscillation a real part of about 1e-16 times 1e5/s, of either sign.
+    # ± 1i/s beside -1e5/s: rounding gives the oscillation a real part of about 1e-16 times 1e5/s,
+    # of either sign.
     rng = np.random.default_rng(3)
     for _ in range(8):
         turned = np.linalg.qr(rng.standard_normal((3, 3)))[0]
@@ -810,21 +1055,29 @@ def test_without_an_equilibrium_under_a_transformation_it_is_not_finite(x64):
 
 def test_nothing_to_see(x64):
     with pytest.raises(
-        ValueError, match="spectrum of this Isometric is zero: it has neither noise nor a harmonic that moves"
+        ValueError,
+        match="spectrum of this Isometric is zero: it has neither noise nor a harmonic that moves",
     ):
         jm.expected_spectrum(references.quiet(jm.Isometric(), harmonic_amplitude=0.0))
     # Without external force the insertion follows the active mass, and noise on K_z moves nothing.
-    unmoved = references.quiet(jm.PrescribedForce(5.0, 0.0), harmonic_amplitude=0.0).replace(noise_K_z=0.1)
+    unmoved = references.quiet(jm.PrescribedForce(5.0, 0.0), harmonic_amplitude=0.0).replace(
+        noise_K_z=0.1
+    )
     with pytest.raises(ValueError, match=r"is zero: .* moves x_z"):
         jm.expected_spectrum(unmoved)
-    with pytest.raises(ValueError, match="is zero: P_w is 0, so that nothing stretches the muscle; set P_w above 0"):
+    with pytest.raises(
+        ValueError, match="is zero: P_w is 0, so that nothing stretches the muscle; set P_w above 0"
+    ):
         jm.expected_spectrum(jm.Isometric(P_w=0.0))
 
 
 @pytest.mark.slow
 def test_a_harmonic_beyond_half_the_sampling_rate(x64):
     task = jm.Isometric().replace(harmonic_frequency=50.0)
-    with pytest.raises(ValueError, match=r"harmonic_frequency = 50.0 Hz is not below half the sampling rate of 100.0 Hz"):
+    with pytest.raises(
+        ValueError,
+        match=r"harmonic_frequency = 50.0 Hz is not below half the sampling rate of 100.0 Hz",
+    ):
         jm.expected_spectrum(task)
     assert np.all(np.isfinite(jm.expected_spectrum(task.replace(harmonic_amplitude=0.0)).power))
     kind, noise, changes = CASES["force, shared OU"]
@@ -841,13 +1094,16 @@ def test_the_expected_spectrum_has_a_second_derivative(x64):
         return jnp.log(jm.expected_spectrum(task.replace(k_w=k)).power[4])
 
     k, step = task["k_w"], 10.0
-    ahead, behind = at_once(lambda ks: jax.lax.map(jax.grad(power), ks), k + step * np.array([1.0, -1.0]))
+    ahead, behind = at_once(
+        lambda ks: jax.lax.map(jax.grad(power), ks), k + step * np.array([1.0, -1.0])
+    )
     second = float(at_once(jax.grad(jax.grad(power)), jnp.asarray(k)))
     assert second == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-4)
 
 
 def test_who_forbids_jax_to_add_axes_can_use_it():
-    """`jax_numpy_rank_promotion = "raise"` finds slips in one's own code; ours must not stand against it."""
+    """`jax_numpy_rank_promotion = "raise"` finds slips in one's own code; ours must not stand
+    against it."""
     task = jm.Isometric()
     with jax.numpy_rank_promotion("raise"):
         with pytest.raises(ValueError, match="rank_promotion"):
@@ -857,5 +1113,8 @@ def test_who_forbids_jax_to_add_axes_can_use_it():
         slope = jax.grad(lambda k_w: jm.expected_spectrum(task.replace(k_w=k_w)).power.sum())
         assert jax.eval_shape(slope, 5e5).shape == ()
         settings = jm.SpectrumSettings(detrend="linear")
-        found = jax.eval_shape(lambda x: jm.spectra.welch(jm.spectra.lowpass(x, settings), settings), np.zeros((2, 3, 1000)))
+        found = jax.eval_shape(
+            lambda x: jm.spectra.welch(jm.spectra.lowpass(x, settings), settings),
+            np.zeros((2, 3, 1000)),
+        )
         assert found.shape == (2, 3, 30)

@@ -1,4 +1,5 @@
-"""Presets that state a mean force: the task is carried to it, its ratios stay, and what cannot be carried is refused."""
+"""Presets that state a mean force: the task is carried to it, its ratios stay, and what cannot be
+carried is refused."""
 
 import json
 
@@ -15,10 +16,15 @@ from jaxmuscle.model._task_tables import task_to_table
 from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
 
 BUNDLED = "zagrodny-slifkin"
-TASKS = {"isometric": jm.Isometric(P_w=3.0), "bundled": jm.load_preset(BUNDLED),
-         "displacement": jm.PrescribedForce(F_ext=jm.model.Constant(1.0)), "no force": jm.Isometric(P_w=0.0),
-         "Hill": eqx.tree_at(lambda t: t.muscle.stiffness_w, jm.Isometric(),
-                             jm.model.QuadraticDamping(c=1e5, v_ref=0.02))}  # fmt: skip
+TASKS = {
+    "isometric": jm.Isometric(P_w=3.0),
+    "bundled": jm.load_preset(BUNDLED),
+    "displacement": jm.PrescribedForce(F_ext=jm.model.Constant(1.0)),
+    "no force": jm.Isometric(P_w=0.0),
+    "Hill": eqx.tree_at(
+        lambda t: t.muscle.stiffness_w, jm.Isometric(), jm.model.QuadraticDamping(c=1e5, v_ref=0.02)
+    ),
+}
 
 
 def written(folder, task="isometric", **stated):
@@ -28,7 +34,9 @@ def written(folder, task="isometric", **stated):
 
 
 @pytest.mark.parametrize("task", ["isometric", "bundled"])
-@pytest.mark.parametrize(("mean", "unit", "newtons"), [(40.5, "N", 40.5), (405, "mN", 0.405), (0.0405, "kN", 40.5)])
+@pytest.mark.parametrize(
+    ("mean", "unit", "newtons"), [(40.5, "N", 40.5), (405, "mN", 0.405), (0.0405, "kN", 40.5)]
+)
 def test_the_task_has_the_mean_force_that_its_file_states(task, mean, unit, newtons, tmp_path, x64):
     loaded, before = jm.load_preset(written(tmp_path, task, mean=mean, unit=unit)), TASKS[task]
     was, found = moments(before), moments(loaded)
@@ -49,15 +57,21 @@ def test_single_precision_reaches_it_as_well(tmp_path):
 
 
 def test_a_fit_from_it_has_its_priors_in_ratio(tmp_path, x64):
-    """The person's own target has nothing more to carry, and P_w is free about what the file says."""
+    """The person's own target has nothing more to carry, and P_w is free about what the file
+    says."""
     loaded = jm.load_preset(written(tmp_path, mean=40.5, unit="N"))
     target = jm.Target("anna", 1 / (1 + np.arange(1, 31) ** 2), mean=40.5, unit="N")
     task, options = at_mean(loaded, target, FitOptions())
     assert options.carried == pytest.approx(1.0, rel=1e-9)
-    centre, usual = (dict(zip(plan.names, plan.centre, strict=True)) for plan in (
-        planned(task, target, options).problem.coordinates,
-        planned(*at_mean(TASKS["isometric"], target, FitOptions())[:1], target, options).problem.coordinates,
-    ))  # fmt: skip
+    centre, usual = (
+        dict(zip(plan.names, plan.centre, strict=True))
+        for plan in (
+            planned(task, target, options).problem.coordinates,
+            planned(
+                *at_mean(TASKS["isometric"], target, FitOptions())[:1], target, options
+            ).problem.coordinates,
+        )
+    )
     factor = 40.5 / float(moments(TASKS["isometric"]).mean)
     assert centre["P_w"] == pytest.approx(3.0 * factor, rel=1e-9)
     assert centre == pytest.approx(usual, rel=1e-9)
@@ -82,22 +96,46 @@ def test_a_fit_json_holds_the_fitted_newtons(tmp_path):
 
 
 WRONG = {
-    "no unit": ({"mean": 40.5}, 'unit is missing: give both, as in mean = 40.5 and unit = "N", or neither'),
+    "no unit": (
+        {"mean": 40.5},
+        'unit is missing: give both, as in mean = 40.5 and unit = "N", or neither',
+    ),
     "no mean": ({"unit": "N"}, "mean is missing: give both"),
-    "% MVC": ({"mean": 30, "unit": "% MVC"}, "unit = '% MVC': the parameters of a task are in newtons; .*mN, kN, .*leave"),
+    "% MVC": (
+        {"mean": 30, "unit": "% MVC"},
+        "unit = '% MVC': the parameters of a task are in newtons; .*mN, kN, .*leave",
+    ),
     "a.u.": ({"mean": 1.5, "unit": "a.u."}, "unit = 'a.u.'"),
     "torque": ({"mean": 1.5, "unit": "N m"}, "unit = 'N m'"),
     "list of units": ({"mean": 1.5, "unit": ["N"]}, r"unit = \['N'\]"),
-    "zero": ({"mean": 0, "unit": "N"}, "mean = 0 N: the mean force of this task is .* of the same sign"),
-    "sign": ({"mean": -40.5, "unit": "mN"}, "mean = -40.5 mN: .* N: give a mean of the same sign, not -0.0405 N"),
-    "text": ({"mean": "40.5", "unit": "N"}, "mean = '40.5': give the mean force in N as one number"),
+    "zero": (
+        {"mean": 0, "unit": "N"},
+        "mean = 0 N: the mean force of this task is .* of the same sign",
+    ),
+    "sign": (
+        {"mean": -40.5, "unit": "mN"},
+        "mean = -40.5 mN: .* N: give a mean of the same sign, not -0.0405 N",
+    ),
+    "text": (
+        {"mean": "40.5", "unit": "N"},
+        "mean = '40.5': give the mean force in N as one number",
+    ),
     "true": ({"mean": True, "unit": "N"}, "mean = True: give"),
     "not finite": ({"mean": float("inf"), "unit": "N"}, "mean = inf is not finite"),
     "trials": ({"mean": [40.1, 40.9], "unit": "N"}, r"mean = \[40.1, 40.9\]: give .* one number"),
-    "displacement": ({"mean": 3, "unit": "N", "task": "displacement"}, "mean = 3 N: the output of Prescribed.* is x_z in m"),
-    "no force": ({"mean": 3.0, "unit": "N", "task": "no force"}, "mean = 3.0 N: the mean force of this task is zero"),
-    "Hill": ({"mean": 3.0, "unit": "N", "task": "Hill"}, "mean = 3.0 N: .*not made of the paper's quadratic laws"),
-}  # fmt: skip
+    "displacement": (
+        {"mean": 3, "unit": "N", "task": "displacement"},
+        "mean = 3 N: the output of Prescribed.* is x_z in m",
+    ),
+    "no force": (
+        {"mean": 3.0, "unit": "N", "task": "no force"},
+        "mean = 3.0 N: the mean force of this task is zero",
+    ),
+    "Hill": (
+        {"mean": 3.0, "unit": "N", "task": "Hill"},
+        "mean = 3.0 N: .*not made of the paper's quadratic laws",
+    ),
+}
 
 
 @pytest.mark.slow

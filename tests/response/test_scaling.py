@@ -1,4 +1,5 @@
-"""Levels of contraction and sizes: what similarity makes exact, and what is published about the variation of force."""
+"""Levels of contraction and sizes: what similarity makes exact, and what is published about the
+variation of force."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,9 @@ SIZES = (0.5, 0.8, 1.0, 1.25, 2.0)
 TASKS = {
     "isometric": jm.Isometric(),
     "ornstein-uhlenbeck": jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise(), P_w=8.0),
-    "absolute noise": jm.Isometric(noise=jm.BandLimitedNoise([20.0, 1.0, 0.1, 0.1], relative=False)),
+    "absolute noise": jm.Isometric(
+        noise=jm.BandLimitedNoise([20.0, 1.0, 0.1, 0.1], relative=False)
+    ),
     "prescribed-force": jm.PrescribedForce(F_ext=jm.model.Constant(1.0)),
     "prescribed-motion": jm.load_preset("zagrodny-slifkin"),
 }
@@ -48,7 +51,8 @@ def test_the_law_of_variation_has_its_extremes_where_people_have_them():
     assert fine[law.argmax()] == 0.95
     at = 0.2, 0.6
     deviation = [level * relative_variation(level) for level in at]
-    # A standard deviation exponential in force (Slifkin & Newell 1999), growing by e per steadiest level.
+    # A standard deviation exponential in force (Slifkin & Newell 1999), growing by e per steadiest
+    # level.
     assert np.log(deviation[1] / deviation[0]) == pytest.approx((at[1] - at[0]) / 0.3, rel=1e-12)
 
 
@@ -71,18 +75,22 @@ def test_variation_of_the_output_is_smallest_near_30_and_largest_at_95_percent(x
 
 @pytest.mark.slow
 def test_simulated_variation_follows_the_law(x64):
-    steady, weak, strong = (jm.settled(at_level(jm.Isometric(), level)) for level in (0.3, 0.05, 0.95))
+    steady, weak, strong = (
+        jm.settled(at_level(jm.Isometric(), level)) for level in (0.3, 0.05, 0.95)
+    )
     seen = []
     for task in (steady, weak, strong):
         force = np.asarray(jm.ensemble(task, jax.random.key(4), seeds=64).between(), dtype=float)
         seen.append(np.sqrt(force.var(axis=1).mean()) / force.mean())
-    # A seed's variance scatters by 0.2, so the root over 64 seeds by about 1.3 %, a ratio of two by 2 %; three of these.
+    # A seed's variance scatters by 0.2, so the root over 64 seeds by about 1.3 %, a ratio of two by
+    # 2 %; three of these.
     assert seen[1] / seen[0] == pytest.approx(relative_variation(0.05), rel=0.06)
     assert seen[2] / seen[0] == pytest.approx(relative_variation(0.95), rel=0.06)
 
 
 def test_one_and_seven_tenths_percent_at_the_steadiest_level_stay_within_what_people_show(x64):
-    # Taylor, Christou & Enoka 2003: 1.7 % near 30 % MVC; bundled recordings: 1.3 % at 26 % MVC, 1.3 and 3.4 % at 45 % MVC.
+    # Taylor, Christou & Enoka 2003: 1.7 % near 30 % MVC; bundled recordings: 1.3 % at 26 % MVC, 1.3
+    # and 3.4 % at 45 % MVC.
     at = {level: 1.7 * relative_variation(level) for level in (0.05, 0.26, 0.45, 0.95)}
     assert 1.3 < at[0.26] < at[0.45] < 3.4
     assert 1.3 < at[0.95] < 5.0 and 1.3 < at[0.05] < 5.0
@@ -94,25 +102,36 @@ def test_the_reference_is_the_task_itself_and_steps_add_up(x64, task):
     assert_same(at_level(task, 0.4, reference=0.4), task)
     law = {"steadiest": 0.33, "resting": 0.2, "damping": 0.7}
     there = at_level(task, 0.9, reference=0.25, **law)
-    assert_same(at_level(at_level(task, 0.5, reference=0.25, **law), 0.9, reference=0.5, **law), there, rtol=1e-8)
+    assert_same(
+        at_level(at_level(task, 0.5, reference=0.25, **law), 0.9, reference=0.5, **law),
+        there,
+        rtol=1e-8,
+    )
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 @pytest.mark.slow
 def test_without_resting_stiffness_forces_follow_the_level_and_nothing_moves(x64, task):
     high = at_level(task, 0.9)
-    np.testing.assert_allclose(jm.response.equilibrium(high), jm.response.equilibrium(task), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        jm.response.equilibrium(high), jm.response.equilibrium(task), rtol=1e-9, atol=1e-12
+    )
     ratio = float(moments(high).mean / moments(task).mean)
     assert ratio == pytest.approx(3.0 if task.output_unit == "N" else 1.0, rel=1e-9)
 
 
 @pytest.mark.slow
 def test_the_spectrum_keeps_its_maximum_at_every_level(x64):
-    """[30]: the maximum of power is at the same frequency at every level, proportional power varies slightly."""
-    spectra = [np.asarray(jm.expected_spectrum(at_level(jm.Isometric(), level)).proportional) for level in LEVELS[1:]]
+    """[30]: the maximum of power is at the same frequency at every level, proportional power varies
+    slightly."""
+    spectra = [
+        np.asarray(jm.expected_spectrum(at_level(jm.Isometric(), level)).proportional)
+        for level in LEVELS[1:]
+    ]
     assert len({int(p.argmax()) for p in spectra}) == 1
     steady = spectra[4]
-    # Half the summed difference is the share of power that moves to other bins: less than a tenth from 10 to 95 % MVC.
+    # Half the summed difference is the share of power that moves to other bins: less than a tenth
+    # from 10 to 95 % MVC.
     assert max(0.5 * np.abs(p - steady).sum() for p in spectra) < 0.1
 
 
@@ -149,7 +168,9 @@ def test_variation_falls_with_strength(x64, task):
 def test_similar_muscles_have_similar_equilibria_and_rates(x64, exponent):
     task = jm.PrescribedForce(F_ext=1.0)
     large = scaled(task, 2.0, time_exponent=exponent)
-    np.testing.assert_allclose(jm.response.equilibrium(large), 2 * jm.response.equilibrium(task), rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(
+        jm.response.equilibrium(large), 2 * jm.response.equilibrium(task), rtol=1e-9, atol=1e-15
+    )
     base = np.asarray(large.muscle.base() / task.muscle.base())
     np.testing.assert_allclose(base, [2.0, 2.0, 2.0 ** (1 + exponent), 2.0 ** (1 + exponent)])
     if exponent == 1.0:
@@ -164,13 +185,18 @@ def test_dynamic_similarity_is_exact_far_from_linear(x64):
     """Twice the size, times stretched by two: x ∝ s, force ∝ s², along the whole nonlinear run."""
     size = 2.0
     still = {f"noise_{c}": 0.0 for c in ("K_w", "K_z", "C_w", "C_z")} | {"harmonic_amplitude": 0.0}
-    small = jm.PrescribedForce(P_w=jm.model.SmoothStep(40.0, rise=0.05), F_ext=2.0, initial=(0.002, 0.1, 0.0, -0.1)).replace(
-        **still
-    )
+    small = jm.PrescribedForce(
+        P_w=jm.model.SmoothStep(40.0, rise=0.05), F_ext=2.0, initial=(0.002, 0.1, 0.0, -0.1)
+    ).replace(**still)
     large = scaled(small, size)
-    stretched = {n: type(s)(s.level, s.start * size, s.rise * size) for n, s in (("P_w", large.P_w), ("F_ext", large.F_ext))}
+    stretched = {
+        n: type(s)(s.level, s.start * size, s.rise * size)
+        for n, s in (("P_w", large.P_w), ("F_ext", large.F_ext))
+    }
     here = np.asarray(jm.simulate(small, jax.random.key(0)).states)[:401]
-    there = jm.simulate(large.with_parts(**stretched), jax.random.key(0), duration=8.0, dt=2e-3, rate=50.0)
+    there = jm.simulate(
+        large.with_parts(**stretched), jax.random.key(0), duration=8.0, dt=2e-3, rate=50.0
+    )
     factors = np.array([size, 1.0, size, 1.0])
     np.testing.assert_allclose(there.states, here * factors, rtol=1e-8, atol=1e-12)
     assert np.abs(here[:, 0]).max() > 2 * float(small["x_ref_w"])
@@ -200,7 +226,11 @@ def test_derivatives_and_batches_go_through(x64):
         assert slope == pytest.approx(float(change(*up) - change(*down)) / (2 * step), rel=1e-5)
     levels = jnp.asarray([0.1, 0.3, 0.9])
     several = at_once(jax.vmap(lambda level: at_level(jm.Isometric(), level)["noise_K_w"]), levels)
-    np.testing.assert_allclose(several, [at_level(jm.Isometric(), float(level))["noise_K_w"] for level in levels], rtol=1e-8)
+    np.testing.assert_allclose(
+        several,
+        [at_level(jm.Isometric(), float(level))["noise_K_w"] for level in levels],
+        rtol=1e-8,
+    )
 
 
 def test_a_task_without_perturbation_stays_without(x64):
@@ -229,11 +259,23 @@ BAD = {
     "reference": (lambda: at_level(jm.Isometric(), 0.3, reference=1.2), "reference = 1.2"),
     "steadiest": (lambda: at_level(jm.Isometric(), 0.3, steadiest=0.0), "steadiest = 0.0"),
     "contrast": (lambda: relative_variation(0.3, contrast=-1.0), "contrast = -1.0"),
-    "resting": (lambda: at_level(jm.Isometric(), 0.3, resting=1.0), r"resting = 1.0 must be in \[0, 1\)"),
-    "no force": (lambda: at_level(jm.PrescribedMotion(F_ext=0.0), 0.3), "F_ext of this PrescribedMotion = 0.*give F_ext"),
+    "resting": (
+        lambda: at_level(jm.Isometric(), 0.3, resting=1.0),
+        r"resting = 1.0 must be in \[0, 1\)",
+    ),
+    "no force": (
+        lambda: at_level(jm.PrescribedMotion(F_ext=0.0), 0.3),
+        "F_ext of this PrescribedMotion = 0.*give F_ext",
+    ),
     "size": (lambda: scaled(jm.Isometric(), 0.0), "size = 0.0 must be positive"),
-    "law": (lambda: scaled(jm.Isometric(muscle=jm.Muscle(stiffness_z=Toe())), 2.0), "quadratic laws.*replace"),
-    "undamped": (lambda: at_level(jm.Isometric().replace(v_ref_w=0.0, v_ref_z=0.0), 0.5), "undamped"),
+    "law": (
+        lambda: scaled(jm.Isometric(muscle=jm.Muscle(stiffness_z=Toe())), 2.0),
+        "quadratic laws.*replace",
+    ),
+    "undamped": (
+        lambda: at_level(jm.Isometric().replace(v_ref_w=0.0, v_ref_z=0.0), 0.5),
+        "undamped",
+    ),
 }
 
 
@@ -256,7 +298,12 @@ def test_the_preset_has_the_papers_noise_and_a_smaller_changing_harmonic(hamilto
     beside = jm.load_preset("zagrodny-slifkin")
     assert "zagrodny-hamilton" in jm.list_presets()
     assert isinstance(hamilton, jm.PrescribedMotion)
-    assert [hamilton[f"noise_{c}"] for c in ("K_w", "K_z", "C_w", "C_z")] == [0.0016, 0.0016, 1e-4, 1e-4]
+    assert [hamilton[f"noise_{c}"] for c in ("K_w", "K_z", "C_w", "C_z")] == [
+        0.0016,
+        0.0016,
+        1e-4,
+        1e-4,
+    ]
     assert hamilton["harmonic_amplitude"] <= 0.7 * beside["harmonic_amplitude"]
     envelope = hamilton.harmonic.envelope
     assert isinstance(envelope, jm.model.Decay)
@@ -283,7 +330,10 @@ def test_the_only_maximum_of_100_simulated_seeds_is_bin_1(x64, hamilton, played,
     assert found.maximum.bin == 1 and not found.local_maxima
     each = np.asarray(played.spectrum().proportional).argmax(axis=1) == 0
     with capsys.disabled():
-        print(f"\nzagrodny-hamilton: {100 * each.mean():.0f} % of 100 single seeds have their maximum in bin 1")
+        print(
+            f"\nzagrodny-hamilton: {100 * each.mean():.0f} % of 100 single seeds have their maximum"
+            " in bin 1"
+        )
     assert each.mean() > 0.9
     # A simulated mean contains what the linear response leaves out: the rest of the input's rise.
     expected = np.asarray(jm.expected_spectrum(hamilton).proportional)
@@ -294,7 +344,9 @@ def test_the_only_maximum_of_100_simulated_seeds_is_bin_1(x64, hamilton, played,
 @pytest.mark.slow
 def test_the_preset_is_smoother_and_its_amplitude_falls(x64, hamilton, played):
     beside = jm.load_preset("zagrodny-slifkin")
-    smooth, rough = (np.asarray(linear_spectrum(t, t.settings).proportional) for t in (hamilton, beside))
+    smooth, rough = (
+        np.asarray(linear_spectrum(t, t.settings).proportional) for t in (hamilton, beside)
+    )
     assert smooth[5:].sum() < 0.2 * rough[5:].sum()  # power above 2.2 Hz
     force = np.asarray(played.output)
     # Three cycles of 0.391 Hz at either end of the analysed window.
@@ -305,9 +357,12 @@ def test_the_preset_is_smoother_and_its_amplitude_falls(x64, hamilton, played):
 # --- another mean force
 
 
-@pytest.mark.parametrize("name", ["isometric", "ornstein-uhlenbeck", "absolute noise", "prescribed-motion"])
+@pytest.mark.parametrize(
+    "name", ["isometric", "ornstein-uhlenbeck", "absolute noise", "prescribed-motion"]
+)
 def test_a_muscle_carried_to_another_force_has_the_same_spectrum(name, x64):
-    """Every force, mass, stiffness and damping times one number: the equations divided by it are the same."""
+    """Every force, mass, stiffness and damping times one number: the equations divided by it are
+    the same."""
     before = moments(TASKS[name])
     mean = 40.0 * float(before.mean)
     after = moments(jm.at_force(TASKS[name], mean))
@@ -324,7 +379,10 @@ def test_carrying_back_is_the_task_and_a_displacement_cannot_be_carried(x64):
         jm.at_force(TASKS["prescribed-force"], 10.0)
     felt = TASKS["prescribed-force"].with_parts(observe="acceleration")
     for move in (lambda: at_level(felt, 0.5), lambda: scaled(felt, 2.0)):
-        with pytest.raises(ValueError, match=r"an acceleration has no coefficient of variation, .* observe='displacement'"):
+        with pytest.raises(
+            ValueError,
+            match=r"an acceleration has no coefficient of variation, .* observe='displacement'",
+        ):
             move()
     with pytest.raises(ValueError, match=r"of the same sign, not -3\.0 N"):
         jm.at_force(task, -3.0)
@@ -335,9 +393,19 @@ def test_carrying_back_is_the_task_and_a_displacement_cannot_be_carried(x64):
 
 @pytest.mark.slow
 def test_a_held_force_tells_no_length():
-    """What the printed fit says: half of both x_ref, twice the stiffness k x_ref², damping and masses, the same force."""
+    """What the printed fit says: half of both x_ref, twice the stiffness k x_ref², damping and
+    masses, the same force."""
     task = jm.Isometric(noise_K_w=0.2, noise_K_z=0.01)
-    factors = {"x_ref_w": 0.5, "x_ref_z": 0.5, "k_w": 8, "k_z": 8, "c_w": 2, "c_z": 2, "m_w": 2, "m_z": 2}
+    factors = {
+        "x_ref_w": 0.5,
+        "x_ref_z": 0.5,
+        "k_w": 8,
+        "k_z": 8,
+        "c_w": 2,
+        "c_z": 2,
+        "m_w": 2,
+        "m_z": 2,
+    }
     half = task.replace(**{name: factor * task[name] for name, factor in factors.items()})
     one, other = (jm.expected_spectrum(each).power for each in (task, half))
     np.testing.assert_allclose(other, one, rtol=2e-4)  # single precision

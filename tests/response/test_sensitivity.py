@@ -23,13 +23,21 @@ def test_every_entry_is_a_difference_quotient(x64):
     for row, name in enumerate(names):
         value = float(TASK[name])
         h = 1e-5 * (value or 1e-2)
-        up, down = (np.asarray(jm.expected_spectrum(TASK.replace(**{name: value + side * h})).power) for side in (1, -1))
+        up, down = (
+            np.asarray(jm.expected_spectrum(TASK.replace(**{name: value + side * h})).power)
+            for side in (1, -1)
+        )
         factor = value if found.relative[row] else 1.0
         absolute = factor * (np.log(up) - np.log(down)) / (2 * h)
         share = factor * (np.log(up / up.sum()) - np.log(down / down.sum())) / (2 * h)
-        # Rounding 1e-13 / 1e-5 and truncation h² times the third derivative, largest for a line that crosses a bin.
-        np.testing.assert_allclose(found.power[row], absolute, rtol=1e-5, atol=1e-6 * np.abs(absolute).max())
-        np.testing.assert_allclose(found.proportional[row], share, rtol=1e-5, atol=1e-6 * np.abs(share).max())
+        # Rounding 1e-13 / 1e-5 and truncation h² times the third derivative, largest for a line
+        # that crosses a bin.
+        np.testing.assert_allclose(
+            found.power[row], absolute, rtol=1e-5, atol=1e-6 * np.abs(absolute).max()
+        )
+        np.testing.assert_allclose(
+            found.proportional[row], share, rtol=1e-5, atol=1e-6 * np.abs(share).max()
+        )
     assert list(found.relative) == [True, True, True, True, False]
 
 
@@ -51,7 +59,8 @@ def test_the_table_has_its_labels():
     assert float(table["value"].sel(parameter="c_w")) == float(TASK["c_w"])
     np.testing.assert_allclose(table["frequency"], TASK.settings.frequency)
     said = {name: value for name, value, _ in whole()._card().rows}
-    assert said["x_ref_w"] == "0.02 m" and said["noise_K_w"] == f"{float(TASK['noise_K_w']):.4g}"  # a share has no unit
+    # a share has no unit
+    assert said["x_ref_w"] == "0.02 m" and said["noise_K_w"] == f"{float(TASK['noise_K_w']):.4g}"
 
 
 @pytest.mark.slow

@@ -1,4 +1,5 @@
-"""Static characteristics against the laws in closed form, for the paper's muscle and for a user's."""
+"""Static characteristics against the laws in closed form, for the paper's muscle and for a
+user's."""
 
 import dataclasses
 
@@ -13,7 +14,8 @@ EXACT = {"rtol": 1e-12, "atol": 1e-12}
 
 
 class Tendon(jm.AbstractMuscle):
-    """A user's muscle: linear active spring with an offset, exponential passive one, linear dampers."""
+    """A user's muscle: linear active spring with an offset, exponential passive one, linear
+    dampers."""
 
     m_w: float = 0.5
     m_z: float = 0.5
@@ -28,16 +30,24 @@ class Tendon(jm.AbstractMuscle):
 
     def passive_force(self, x_w, v_w, x_z, v_z, u):
         stretch = x_z - x_w
-        return 2.0 * (1.0 - 2.718281828459045 ** (-100.0 * stretch)) + u[1] * stretch + (5.0 + u[3]) * (v_z - v_w)
+        return (
+            2.0 * (1.0 - 2.718281828459045 ** (-100.0 * stretch))
+            + u[1] * stretch
+            + (5.0 + u[3]) * (v_z - v_w)
+        )
 
     def contraction_velocity(self, x_w, x_z, v_z, force, u):
-        return v_z - (force - 2.0 * (1.0 - 2.718281828459045 ** (-100.0 * (x_z - x_w))) - u[1] * (x_z - x_w)) / (5.0 + u[3])
+        return v_z - (
+            force - 2.0 * (1.0 - 2.718281828459045 ** (-100.0 * (x_z - x_w))) - u[1] * (x_z - x_w)
+        ) / (5.0 + u[3])
 
 
 @pytest.mark.parametrize("argument", ["literal", "elongation"])
 @pytest.mark.slow
 def test_the_papers_laws_are_found(argument):
-    task = jm.Isometric(muscle=jm.Muscle(argument=argument)).replace(k_z=3e5, c_w=50.0, x_ref_w=0.01)
+    task = jm.Isometric(muscle=jm.Muscle(argument=argument)).replace(
+        k_z=3e5, c_w=50.0, x_ref_w=0.01
+    )
     seen = static_characteristics(task, span=0.03, speed=2.0)
     x, v = seen.displacement, seen.velocity
     np.testing.assert_allclose(x, np.linspace(-0.03, 0.03, 201), **EXACT)
@@ -53,8 +63,10 @@ def test_the_papers_laws_are_found(argument):
 @pytest.mark.slow
 def test_force_at_the_insertion_solves_the_statics():
     seen = static_characteristics(jm.Isometric(), points=41)
-    for x, force, P in [*zip(seen.displacement, seen.F_ext, [0.0] * 41, strict=True),
-                        *zip(seen.displacement, seen.F_ext_active, [5.0] * 41, strict=True)]:  # fmt: skip
+    for x, force, P in [
+        *zip(seen.displacement, seen.F_ext, [0.0] * 41, strict=True),
+        *zip(seen.displacement, seen.F_ext_active, [5.0] * 41, strict=True),
+    ]:
         # k (x_ref² + x_w²) x_w + K_z(x) (x_w - x) = P with the paper's K_z at x_z = x
         k, ref = 5e5, 0.02
         K_z = k * (ref**2 + x**2)
@@ -70,7 +82,8 @@ def test_the_operating_point_is_the_tasks(kind):
     seen = static_characteristics(task)
     middle = np.interp(seen.x_z, seen.displacement, seen.F_ext_active)
     load = {"Isometric": middle, "PrescribedForce": 0.0, "PrescribedMotion": 10.0}[kind.__name__]
-    assert seen.x_w == pytest.approx(float(jm.response.equilibrium(task)[0]), rel=1e-4)  # that one in single precision
+    # that one in single precision
+    assert seen.x_w == pytest.approx(float(jm.response.equilibrium(task)[0]), rel=1e-4)
     # Straight lines between 201 points of a curve that bends by 1e5 N/m² over steps of 2e-4 m.
     assert middle == pytest.approx(load, abs=2e-3)
 
@@ -104,7 +117,11 @@ def test_the_figure_has_units_a_legend_and_the_callers_axes():
     figure, given = plt.subplots(1, 3)
     axes = seen.plot(given)
     assert list(axes) == list(given)
-    assert [ax.get_xlabel() for ax in axes] == ["Displacement (mm)", "Velocity (m/s)", "Displacement (mm)"]
+    assert [ax.get_xlabel() for ax in axes] == [
+        "Displacement (mm)",
+        "Velocity (m/s)",
+        "Displacement (mm)",
+    ]
     assert [ax.get_ylabel() for ax in axes] == ["Stiffness (N/m)", "Damping (N s/m)", "Force (N)"]
     np.testing.assert_allclose(axes[0].lines[0].get_ydata(), seen.K_w)
     assert all(ax.get_legend() is not None for ax in axes)
@@ -120,7 +137,10 @@ def test_the_force_under_a_drive_is_drawn_where_there_is_one(P_w, count):
     seen = StaticCharacteristics(**dict.fromkeys(names, x) | {"P_w": P_w, "x_w": 0.002, "x_z": 0.0})
     figure, given = plt.subplots(1, 3)
     seen.plot(given)
-    assert sum(str(line.get_label()).startswith("$F_\\mathrm{ext}$") for line in given[2].lines) == count
+    assert (
+        sum(str(line.get_label()).startswith("$F_\\mathrm{ext}$") for line in given[2].lines)
+        == count
+    )
     plt.close(figure)
 
 

@@ -1,4 +1,5 @@
-"""The moved insertion: linear response and nonlinear simulation against formulas and integration written here."""
+"""The moved insertion: linear response and nonlinear simulation against formulas and integration
+written here."""
 
 import jax
 import jax.numpy as jnp
@@ -34,11 +35,14 @@ def formula(f):
 
 
 def multisine(amplitude, period=10.0, rate=1000.0, periods=2):
-    """Lines from 0.1 to 8 Hz with random phases, and their derivatives; `amplitude` is that of a line."""
+    """Lines from 0.1 to 8 Hz with random phases, and their derivatives; `amplitude` is that of a
+    line."""
     rng, t = np.random.default_rng(4), np.arange(round(periods * period * rate) + 1) / rate
     lines = np.array([1, 3, 7, 13, 27, 49, 80]) / period
     turns = np.exp(1j * (2 * np.pi * np.outer(t, lines) + rng.uniform(0, 2 * np.pi, len(lines))))
-    return lines, amplitude * np.stack([np.real(turns @ (2j * np.pi * lines) ** n) for n in (0, 1, 2)])
+    return lines, amplitude * np.stack(
+        [np.real(turns @ (2j * np.pi * lines) ** n) for n in (0, 1, 2)]
+    )
 
 
 def at_lines(signal, lines, rate):
@@ -58,9 +62,13 @@ def test_forward_reverse_and_differences_agree():
     with jax.enable_x64(True):
 
         def real(k_w):
-            return jnp.sum(jnp.abs(jm.response.dynamic_stiffness(TASK.replace(k_w=k_w), FREQUENCY)) ** 2)
+            return jnp.sum(
+                jnp.abs(jm.response.dynamic_stiffness(TASK.replace(k_w=k_w), FREQUENCY)) ** 2
+            )
 
-        forward, reverse = (at_once(slope(real), jnp.asarray(K_W)) for slope in (jax.jacfwd, jax.grad))
+        forward, reverse = (
+            at_once(slope(real), jnp.asarray(K_W)) for slope in (jax.jacfwd, jax.grad)
+        )
         step = 1e-4 * K_W
         between = (real(K_W + step) - real(K_W - step)) / (2 * step)
     np.testing.assert_allclose(reverse, forward, rtol=1e-10)
@@ -73,14 +81,15 @@ def test_a_small_motion_is_answered_linearly():
     lines, motion = multisine(1e-6)
     with jax.enable_x64(True):
         force = driven(TASK, motion, 1e-3)
-    measured = -at_lines(force, lines, 500.0) / at_lines(motion[0], lines, 1000.0) * 2  # half as many samples
+    # half as many samples
+    measured = -at_lines(force, lines, 500.0) / at_lines(motion[0], lines, 1000.0) * 2
     np.testing.assert_allclose(measured, formula(lines), rtol=1e-4)
 
 
 @pytest.mark.parametrize(("m_w", "close"), [(M_W, 1e-6), (0.01, 1e-5)])
 def test_a_large_motion_is_answered_as_scipy_integrates_it(m_w, close):
-    """A light and damped tissue has a rate of 5100 /s: a step of 2 ms is cut into eight, which still see little of how it
-    jumps to its speed at the begin."""
+    """A light and damped tissue has a rate of 5100 /s: a step of 2 ms is cut into eight, which
+    still see little of how it jumps to its speed at the begin."""
     _, motion = multisine(1e-3)
     t = np.arange(motion.shape[1]) / 1000.0
 
@@ -94,12 +103,30 @@ def test_a_large_motion_is_answered_as_scipy_integrates_it(m_w, close):
         x_z, v_z = smooth(now)
         return [
             y[1],
-            (PULL - C_W * (1 + y[1] ** 2) * y[1] - K_W * (X_REF**2 + y[0] ** 2) * y[0] + passive(y, x_z, v_z)) / m_w,
+            (
+                PULL
+                - C_W * (1 + y[1] ** 2) * y[1]
+                - K_W * (X_REF**2 + y[0] ** 2) * y[0]
+                + passive(y, x_z, v_z)
+            )
+            / m_w,
         ]
 
     at = t[:2001:2]
-    found = solve_ivp(exact, (0.0, at[-1]), [rest(), 0.0], method="LSODA", t_eval=at, rtol=1e-11, atol=1e-13, max_step=0.01)
-    expected = -(passive(found.y, *motion[:2, :2001:2]) + M_Z * motion[2, :2001:2]) - K_Z * X_REF**2 * rest()
+    found = solve_ivp(
+        exact,
+        (0.0, at[-1]),
+        [rest(), 0.0],
+        method="LSODA",
+        t_eval=at,
+        rtol=1e-11,
+        atol=1e-13,
+        max_step=0.01,
+    )
+    expected = (
+        -(passive(found.y, *motion[:2, :2001:2]) + M_Z * motion[2, :2001:2])
+        - K_Z * X_REF**2 * rest()
+    )
     with jax.enable_x64(True):
         force = driven(task, motion, 1e-3)[: len(at)]
     np.testing.assert_allclose(force, expected, atol=close * np.max(np.abs(expected)))
@@ -107,11 +134,14 @@ def test_a_large_motion_is_answered_as_scipy_integrates_it(m_w, close):
 
 @pytest.mark.slow
 def test_simulate_moves_the_insertion():
-    """The ordinary simulation with the motion as a signal, without noise, against the same at fixed steps."""
+    """The ordinary simulation with the motion as a signal, without noise, against the same at fixed
+    steps."""
     _, motion = multisine(1e-3, periods=1)
     t = np.arange(motion.shape[1]) / 1000.0
     moved, held = Sampled.through(t[::5], motion[0, ::5]), jm.model.Constant(PULL)
-    quiet = TASK.with_parts(x_z=moved, P_w=held, noise=jm.BandLimitedNoise(0.0), initial=(rest(), 0.0))
+    quiet = TASK.with_parts(
+        x_z=moved, P_w=held, noise=jm.BandLimitedNoise(0.0), initial=(rest(), 0.0)
+    )
     with jax.enable_x64(True):
         run = jm.simulate(quiet, jax.random.key(0), duration=8.0, dt=1e-3)
         expected = driven(TASK, motion, 1e-3) + K_Z * X_REF**2 * rest()
@@ -124,8 +154,11 @@ def test_an_insertion_at_rest_is_isometric():
     one = jm.PrescribedLength(x_z=0.003)
     other = jm.Isometric(x_z=0.003)
     a, b = (np.asarray(jm.simulate(task, jax.random.key(1)).output) for task in (one, other))
-    np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6 * np.abs(b).max())  # single precision, and b passes zero
-    np.testing.assert_allclose(jm.expected_spectrum(one).power, jm.expected_spectrum(other).power, rtol=1e-4)
+    # single precision, and b passes zero
+    np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6 * np.abs(b).max())
+    np.testing.assert_allclose(
+        jm.expected_spectrum(one).power, jm.expected_spectrum(other).power, rtol=1e-4
+    )
 
 
 def test_the_density_of_the_noise():
@@ -141,7 +174,9 @@ def test_the_density_of_the_noise():
 
 
 def test_what_has_no_stiffness_is_refused():
-    with pytest.raises(ValueError, match=r"PrescribedForce, in which the insertion is not moved.*as_task"):
+    with pytest.raises(
+        ValueError, match=r"PrescribedForce, in which the insertion is not moved.*as_task"
+    ):
         jm.response.dynamic_stiffness(jm.PrescribedForce(), FREQUENCY)
     moving = TASK.with_parts(x_z=SmoothStep(0.01, start=4.0, rise=10.0))
     with pytest.raises(ValueError, match="x_z of this PrescribedLength moves"):

@@ -30,13 +30,19 @@ def made(tmp_path_factory):
     found = {}
     for platform in ("cpu", ""):
         path = tmp_path_factory.mktemp("gpu") / "made.npz"
-        subprocess.run([sys.executable, "-c", PROGRAM, str(path)], env=os.environ | {"JAX_PLATFORMS": platform}, check=True)
+        subprocess.run(
+            [sys.executable, "-c", PROGRAM, str(path)],
+            env=os.environ | {"JAX_PLATFORMS": platform},
+            check=True,
+        )
         with np.load(path) as data:
             found[platform or "device"] = dict(data)
     return found
 
 
-@pytest.mark.parametrize(("name", "bound"), [("normals", 1e-6), ("path", 1e-5), ("mean", 1e-5), ("power", 1e-3)])
+@pytest.mark.parametrize(
+    ("name", "bound"), [("normals", 1e-6), ("path", 1e-5), ("mean", 1e-5), ("power", 1e-3)]
+)
 def test_a_device_gives_what_the_processor_gives(made, name, bound):
     here, there = made["cpu"][name], made["device"][name]
     assert here.shape == there.shape and np.isfinite(here).all()

@@ -1,4 +1,5 @@
-"""Derivatives of a simulated log spectrum by every parameter: forward = reverse = finite differences."""
+"""Derivatives of a simulated log spectrum by every parameter: forward = reverse = finite
+differences."""
 
 import jax
 import jax.numpy as jnp
@@ -42,9 +43,15 @@ def test_every_parameter_forward_reverse_and_by_differences(x64, name):
         return jnp.log(run.spectrum(window=(1.0, 4.0)).power)
 
     n, h = len(names), 1e-5  # truncation h² f''' / 6 and rounding 1e-15 / h
-    # One program for derivatives and differences: values and slopes along a parameter, at one and a little off.
-    along, off = (np.concatenate(rows) for rows in ([np.eye(n)] * 3, [0 * np.eye(n), h * np.eye(n), -h * np.eye(n)]))
-    power, slopes = at_once(jax.vmap(lambda at, to: jax.jvp(log_power, (at,), (to,))), 1 + off, along)
+    # One program for derivatives and differences: values and slopes along a parameter, at one and a
+    # little off.
+    along, off = (
+        np.concatenate(rows)
+        for rows in ([np.eye(n)] * 3, [0 * np.eye(n), h * np.eye(n), -h * np.eye(n)])
+    )
+    power, slopes = at_once(
+        jax.vmap(lambda at, to: jax.jvp(log_power, (at,), (to,))), 1 + off, along
+    )
     _, ahead, behind = np.split(np.asarray(power), 3)
     forward, differences = np.asarray(slopes)[:n].T, (ahead - behind).T / (2 * h)
     # A fault of the reverse mode in any bin shows in their sum with weights at random.
@@ -69,7 +76,9 @@ def test_a_parameter_by_its_natural_name(x64):
 
     slope = at_once(jax.grad(last_force), jnp.asarray(task["k_w"]))
     h = 1e-4 * task["k_w"]
-    np.testing.assert_allclose(slope, (last_force(task["k_w"] + h) - last_force(task["k_w"] - h)) / (2 * h), rtol=1e-6)
+    np.testing.assert_allclose(
+        slope, (last_force(task["k_w"] + h) - last_force(task["k_w"] - h)) / (2 * h), rtol=1e-6
+    )
 
 
 @pytest.mark.slow
@@ -82,10 +91,14 @@ def test_a_mean_spectrum_and_the_filtered_output_by_differences(x64):
         estimate = runs.mean_spectrum()
         assert estimate.expected is not None
         scatter = jnp.asarray(runs.filtered()).std(axis=1)
-        return jnp.concatenate([jnp.log(estimate.power), jnp.log(estimate.stderr), jnp.log(scatter)])
+        return jnp.concatenate(
+            [jnp.log(estimate.power), jnp.log(estimate.stderr), jnp.log(scatter)]
+        )
 
     h = 5.0
     ahead, value, behind = (np.asarray(of(k_w)) for k_w in (5e5 + h, 5e5, 5e5 - h))
     again, slope = drawing(lambda k_w: jax.jvp(of, (k_w,), (jnp.ones_like(k_w),)))(jnp.asarray(5e5))
     np.testing.assert_allclose(again, value, rtol=1e-9)
-    np.testing.assert_allclose(slope, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5 * np.abs(slope).max())
+    np.testing.assert_allclose(
+        slope, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5 * np.abs(slope).max()
+    )

@@ -31,7 +31,8 @@ def coarsened(path, factor):
 def strong_errors(task, factors):
     """Root mean square over seeds of the final state's distance from that of the finest grid."""
     steps = int(FINE * SECONDS)
-    keys, scale = jax.random.split(KEY, SEEDS), np.array([30.0, 1.0])  # displacement as velocity, eigenfrequency 30/s
+    # displacement as velocity, eigenfrequency 30/s
+    keys, scale = jax.random.split(KEY, SEEDS), np.array([30.0, 1.0])
 
     def drawn(key):
         path = task.noise.realise(task.noise.draw(key, steps), 1 / FINE)
@@ -43,12 +44,17 @@ def strong_errors(task, factors):
         grid = Grid(factor / FINE, steps // factor, steps // factor)
 
         def ended(path):
-            return respond(task, coarsened(Realisation(*path), factor), grid, "instant")[0][-1] * scale
+            return (
+                respond(task, coarsened(Realisation(*path), factor), grid, "instant")[0][-1] * scale
+            )
 
         return at_once(jax.vmap(ended), fine)
 
     reference = final(fine, 1)
-    return [float(jnp.sqrt(jnp.mean(jnp.sum((final(fine, factor) - reference) ** 2, axis=-1)))) for factor in factors]
+    return [
+        float(jnp.sqrt(jnp.mean(jnp.sum((final(fine, factor) - reference) ** 2, axis=-1))))
+        for factor in factors
+    ]
 
 
 ROUND, ROUND_SECONDS = 8000, 2.0  # steps per second of the finest path of the round trip
@@ -56,7 +62,8 @@ ROUND, ROUND_SECONDS = 8000, 2.0  # steps per second of the finest path of the r
 
 @functools.cache
 def recorded(factor):
-    """What a task gives on a grid of `factor` times the finest step: one program for tasks of one structure."""
+    """What a task gives on a grid of `factor` times the finest step: one program for tasks of one
+    structure."""
     grid = Grid(factor / ROUND, int(ROUND_SECONDS * ROUND) // factor, 1)
     path = lambda given: coarsened(Realisation(*given), factor)  # noqa: E731
     return kept_jit(lambda task, given: respond(task, path(given), grid, "instant")[1])
@@ -75,23 +82,29 @@ def unit_path():
 
 
 def moving(noise):
-    """An isometric muscle set free at 2 cm with 1 m/s, so that velocities matter, without its harmonic."""
-    task = jm.Isometric(jm.model.Constant(2.0), noise=noise, harmonic=jm.Harmonic(0.0), initial=(0.02, 1.0))
+    """An isometric muscle set free at 2 cm with 1 m/s, so that velocities matter, without its
+    harmonic."""
+    task = jm.Isometric(
+        jm.model.Constant(2.0), noise=noise, harmonic=jm.Harmonic(0.0), initial=(0.02, 1.0)
+    )
     return task.replace(c_w=8.0, c_z=1.0)
 
 
-FACTORS = np.array([4, 16])  # 0.25 ms to 1 ms; what is between adds nothing to a slope over equal distances
+# 0.25 ms to 1 ms; what is between adds nothing to a slope over equal distances
+FACTORS = np.array([4, 16])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "noise, order",
     [
-        # Stiffness noises multiply positions and push velocities: they commute, Heun is of order one.
+        # Stiffness noises multiply positions and push velocities: they commute, Heun is of order
+        # one.
         (jm.WhiteNoise({"K_w": 1.0}), 1.0),
         # With damping noise they do not: without the Lévy area no more than one half.
         (jm.WhiteNoise({"K_w": 3.0, "C_w": 2.0}), 0.5),
-        # Continuous, but the trapezoid's error of a Brownian bridge remains, √steps times step^{3/2}.
+        # Continuous, but the trapezoid's error of a Brownian bridge remains, √steps times
+        # step^{3/2}.
         (jm.OrnsteinUhlenbeckNoise({"K_w": 0.6, "C_w": 0.3}, 0.05), 1.0),
         # Differentiable and exact on the grid: √steps times step^{5/2}, as Heun's own.
         (jm.BandLimitedNoise({"K_w": 3.0, "C_w": 0.5}, cutoff=20.0), 2.0),
@@ -100,11 +113,12 @@ FACTORS = np.array([4, 16])  # 0.25 ms to 1 ms; what is between adds nothing to 
 )
 def test_strong_order(x64, noise, order):
     errors = strong_errors(moving(noise), [int(factor) for factor in FACTORS])
-    # The reference errs, too. Rough noise adds independent errors at every refinement, so that squares subtract,
-    # h^2p - h_ref^2p; smooth errors subtract themselves.
+    # The reference errs, too. Rough noise adds independent errors at every refinement, so that
+    # squares subtract, h^2p - h_ref^2p; smooth errors subtract themselves.
     power = 2 * order if order < 2 else order
     steps = (FACTORS**power - 1) ** (1 / power)
-    # Spread of a root mean square over 400 seeds 4 to 7 %, over a factor of four in the step; next orders add as much.
+    # Spread of a root mean square over 400 seeds 4 to 7 %, over a factor of four in the step; next
+    # orders add as much.
     assert abs(references.observed_order(steps, errors) - order) < 0.15, errors
 
 
@@ -113,8 +127,8 @@ def test_strong_order(x64, noise, order):
     "amplitude, lowest, bound",
     [
         ((0.05, 0.0, 0.01, 0.0), 1.9, 1e-5),
-        # P_w then contains N', as rough as Brownian motion: what its samples leave out between them is of order one,
-        # give or take what one path happens to be.
+        # P_w then contains N', as rough as Brownian motion: what its samples leave out between them
+        # is of order one, give or take what one path happens to be.
         ((0.05, 0.05, 0.01, 0.01), 0.7, 3e-3),
     ],
     ids=["active", "active and passive"],
@@ -122,7 +136,10 @@ def test_strong_order(x64, noise, order):
 def test_what_task_1_asks_for_moves_task_2_the_same_way(x64, amplitude, lowest, bound):
     noise = jm.BandLimitedNoise(amplitude, cutoff=10.0)
     forward = jm.PrescribedMotion(
-        jm.model.RampHold(0.005), jm.model.SmoothStep(2.0, 0.3, 1.0), noise=noise, harmonic=jm.Harmonic(0.02, 4.25, 0.4)
+        jm.model.RampHold(0.005),
+        jm.model.SmoothStep(2.0, 0.3, 1.0),
+        noise=noise,
+        harmonic=jm.Harmonic(0.02, 4.25, 0.4),
     )
     errors, dts = [], []
     for factor in (16, 4):

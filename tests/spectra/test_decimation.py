@@ -23,7 +23,9 @@ def test_single_precision_keeps_the_digits_of_the_fluctuations():
     x = 50.0 + np.random.default_rng(0).normal(size=2001)
     rounded = decimated(x.astype(np.float32), 10)
     assert rounded.dtype == np.float32
-    np.testing.assert_allclose(rounded, scipy.signal.resample_poly(x, 1, 10, padtype="line"), atol=4 * 50.0 * 6e-8)
+    np.testing.assert_allclose(
+        rounded, scipy.signal.resample_poly(x, 1, 10, padtype="line"), atol=4 * 50.0 * 6e-8
+    )
 
 
 @pytest.mark.slow
@@ -35,7 +37,8 @@ def test_gradients_are_those_of_a_linear_map(x64):
 
 
 def test_what_passes():
-    """In the analysed band all of it; half of the amplitude at half the rate; little of what would come back below 42 Hz."""
+    """In the analysed band all of it; half of the amplitude at half the rate; little of what would
+    come back below 42 Hz."""
     f, gain = scipy.signal.freqz(anti_alias(FINER), fs=100.0 * FINER, worN=8000)
     gain = np.abs(gain)
     assert np.all(np.abs(gain[f < 40] - 1) < 0.006) and np.all(gain[f > 60] < 0.004)

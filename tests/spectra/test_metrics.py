@@ -1,4 +1,5 @@
-"""Metrics against their definitions, written a second time and slowly, and against analytic values."""
+"""Metrics against their definitions, written a second time and slowly, and against analytic
+values."""
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +33,8 @@ RECORDS = {
 
 @pytest.fixture
 def user_view():
-    """As a user runs it: without the run-time type check, which would see a wrong argument first."""
+    """As a user runs it: without the run-time type check, which would see a wrong argument
+    first."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
@@ -46,7 +48,10 @@ def slow_approximate_entropy(x, m, tolerance):
     def phi(m):
         n = len(x) - m + 1
         radius = tolerance * np.std(x)
-        return sum(np.log(sum(matching(x, i, j, m, radius) for j in range(n)) / n) for i in range(n)) / n
+        return (
+            sum(np.log(sum(matching(x, i, j, m, radius) for j in range(n)) / n) for i in range(n))
+            / n
+        )
 
     return phi(m) - phi(m + 1)
 
@@ -81,8 +86,11 @@ def test_entropies_are_those_of_antropy(name):
 
 @pytest.mark.slow
 def test_sample_entropy_of_white_noise():
-    """Independent normal samples match with probability erf(r/2), so SampEn = -ln erf(r/2), for r in σ."""
-    values = [sample_entropy(np.random.default_rng(seed).standard_normal(2000)) for seed in range(60)]
+    """Independent normal samples match with probability erf(r/2), so SampEn = -ln erf(r/2), for r
+    in σ."""
+    values = [
+        sample_entropy(np.random.default_rng(seed).standard_normal(2000)) for seed in range(60)
+    ]
     standard_error = np.std(values, ddof=1) / np.sqrt(len(values))
     assert standard_error < 0.02
     assert abs(np.mean(values) + np.log(erf(0.1))) < 4 * standard_error
@@ -100,10 +108,17 @@ def test_entropy_of_ten_thousand_samples_is_near_that_of_its_parts():
 def test_neighbours_of_a_long_record_are_those_of_a_tree(kind, m):
     rng = np.random.default_rng(4)
     x = rng.standard_normal(FEW + 500)
-    x = {"noise": x, "slow": np.cumsum(x), "few values": np.round(x), "mostly constant": x * (x > 2)}[kind]
+    x = {
+        "noise": x,
+        "slow": np.cumsum(x),
+        "few values": np.round(x),
+        "mostly constant": x * (x > 2),
+    }[kind]
     templates = np.lib.stride_tricks.sliding_window_view(x, m)
     radius = 1.0 if kind == "few values" else 0.2 * np.std(x)  # whole numbers lie at the very bound
-    tree = KDTree(templates, leafsize=100).query_ball_point(templates, radius, p=np.inf, return_length=True)
+    tree = KDTree(templates, leafsize=100).query_ball_point(
+        templates, radius, p=np.inf, return_length=True
+    )
     np.testing.assert_array_equal(neighbours(templates, radius), tree)
 
 
@@ -180,7 +195,11 @@ def test_spearman_without_ties_is_the_textbook_formula():
 
 def test_spearman_needs_two_rows_with_ranks():
     x = np.arange(5.0)
-    for a, b, message in ((x, x[:4], "equally long"), (x[:2], x[:2], "3 or more"), (x, 0 * x, "b=.*not all equal")):
+    for a, b, message in (
+        (x, x[:4], "equally long"),
+        (x[:2], x[:2], "3 or more"),
+        (x, 0 * x, "b=.*not all equal"),
+    ):
         with pytest.raises(ValueError, match=message):
             spearman(a, b)
     with pytest.raises(ValueError, match=r"^a=.*finite"):
@@ -243,7 +262,8 @@ def test_interpolation_is_exact_for_a_gaussian(x64):
 
 @pytest.mark.parametrize("hertz", [4.251, 1.24, 7.0])
 def test_interpolation_finds_a_sine(x64, hertz):
-    """The log of a Hann main lobe is a parabola to within 0.02 bins; the bin itself is up to half a bin away."""
+    """The log of a Hann main lobe is a parabola to within 0.02 bins; the bin itself is up to half a
+    bin away."""
     settings = SpectrumSettings(filter_cutoff=None)
     sine = np.sin(2 * np.pi * hertz * np.arange(1500) / 100)
     peak = peaks(spectrum_of(sine, settings)).maximum

@@ -1,4 +1,5 @@
-"""How much a spectrum scatters, and what that leaves undetermined: closed forms against simulated spectra and fits."""
+"""How much a spectrum scatters, and what that leaves undetermined: closed forms against simulated
+spectra and fits."""
 
 import numpy as np
 import pytest
@@ -14,14 +15,33 @@ from jaxmuscle.objective._covariance import (
     known_products,
     parameter_covariance,
 )
-from jaxmuscle.spectra._bin_law import bin_statistics, log_power_moments, shares_map, standardised, welch_law
+from jaxmuscle.spectra._bin_law import (
+    bin_statistics,
+    log_power_moments,
+    shares_map,
+    standardised,
+    welch_law,
+)
 
 BINS = np.arange(1, 31)
 FLAT = np.full(30, 1 / 30)
-NAMES = ("k_w", "k_z", "c_w", "c_z", "harmonic_amplitude", "harmonic_frequency", "noise_K_w", "noise_K_z")
-PERTURBATION = "all amplitudes of noise and harmonic can be multiplied by one number, and the fit stays as good"
+NAMES = (
+    "k_w",
+    "k_z",
+    "c_w",
+    "c_z",
+    "harmonic_amplitude",
+    "harmonic_frequency",
+    "noise_K_w",
+    "noise_K_z",
+)
+PERTURBATION = (
+    "all amplitudes of noise and harmonic can be multiplied by one number, and the fit stays as"
+    " good"
+)
 MECHANICS = (
-    "all stiffness and damping can be multiplied by one number, and the fit stays as good: at most their ratios are known"
+    "all stiffness and damping can be multiplied by one number, and the fit stays as good: at most"
+    " their ratios are known"
 )
 # A published number of two digits stands for everything that rounds to it.
 TWO_DIGITS = 0.005
@@ -29,7 +49,9 @@ TWO_DIGITS = 0.005
 
 def welch_powers(signals, settings):
     """Powers in bins 1 to 30, by scipy."""
-    _, power = scipy.signal.welch(signals, settings.rate, settings.window, settings.length, settings.length - settings.step)
+    _, power = scipy.signal.welch(
+        signals, settings.rate, settings.window, settings.length, settings.length - settings.step
+    )
     return power[:, BINS]
 
 
@@ -47,7 +69,10 @@ def test_log_power_moments_are_those_of_simulated_chi_squared(nu):
     bias, variance = log_power_moments(nu)
     scatter = (log - log.mean()) ** 2
     references.assert_standard_normal(
-        [(x.mean() - expected) / scipy.stats.sem(x) for x, expected in ((log, bias), (scatter, variance))]
+        [
+            (x.mean() - expected) / scipy.stats.sem(x)
+            for x, expected in ((log, bias), (scatter, variance))
+        ]
     )
 
 
@@ -61,19 +86,30 @@ def test_hann_bins_of_half_overlap_correlate_as_published():
 
 @pytest.mark.parametrize(
     ("changes", "segments"),
-    [({}, 1), ({}, 12), ({"overlap": 0.75}, 2), ({"window": "hamming", "overlap": 0.25}, 6), ({"overlap": 0.0}, 4)],
+    [
+        ({}, 1),
+        ({}, 12),
+        ({"overlap": 0.75}, 2),
+        ({"window": "hamming", "overlap": 0.25}, 6),
+        ({"overlap": 0.0}, 4),
+    ],
 )
 def test_the_correlation_is_that_of_white_noise(changes, segments):
     settings = jm.SpectrumSettings(**changes)
     expected = welch_law(settings, BINS, (segments,)).correlation[10, 10:]
     x = white(2000, segments, settings)[:, 3:] - 1  # detrending touches the first bins
     variance = np.mean(x[:, :-3] ** 2, axis=1)
-    excess = [np.mean(x[:, :-3] * x[:, d : d - 3 or None], axis=1) - expected[d] * variance for d in (1, 2, 3)]
+    excess = [
+        np.mean(x[:, :-3] * x[:, d : d - 3 or None], axis=1) - expected[d] * variance
+        for d in (1, 2, 3)
+    ]
     references.assert_standard_normal([q.mean() / scipy.stats.sem(q) for q in excess])
 
 
 def test_bins_that_are_left_out_change_nothing():
-    some, full = (welch_law(jm.SpectrumSettings(), bins, (6,)) for bins in (np.array([2, 4, 5]), BINS))
+    some, full = (
+        welch_law(jm.SpectrumSettings(), bins, (6,)) for bins in (np.array([2, 4, 5]), BINS)
+    )
     np.testing.assert_allclose(some.correlation, full.correlation[np.ix_([1, 3, 4], [1, 3, 4])])
     np.testing.assert_allclose(some.degrees, full.degrees[[1, 3, 4]])
 
@@ -90,9 +126,11 @@ def coloured(realisations, segments, corner, seed=1):
 @pytest.mark.slow
 @pytest.mark.parametrize("corner", [np.inf, 0.9], ids=["white", "falling"])
 def test_statistics_are_those_of_measured_log_powers(corner):
-    """Also of bin 1, which detrending and negative frequencies leave 0.8 times the degrees of freedom of the others.
+    """Also of bin 1, which detrending and negative frequencies leave 0.8 times the degrees of
+    freedom of the others.
 
-    That of a spectrum that falls from 0.9 Hz on, as muscle force has it, is not flat within the resolution: within 3 %.
+    That of a spectrum that falls from 0.9 Hz on, as muscle force has it, is not flat within the
+    resolution: within 3 %.
     """
     segments = 12
     log = np.log(coloured(2000, segments, corner))
@@ -100,7 +138,8 @@ def test_statistics_are_those_of_measured_log_powers(corner):
     for bins in (slice(0, 1), slice(1, 30)):
         found = np.sqrt(np.mean(log[:, bins].var(axis=0, ddof=1)))
         stated = np.sqrt(np.mean(statistics.sd[bins] ** 2))
-        # Half the relative error of a variance; of 29 bins, neighbours correlated, about 18 are independent.
+        # Half the relative error of a variance; of 29 bins, neighbours correlated, about 18 are
+        # independent.
         error = np.sqrt((1 + 3 / statistics.half.min()) / 2 / 2000 / (1 if bins.stop == 1 else 18))
         assert abs(found / stated - 1) < 4 * error + (0.0 if np.isinf(corner) else 0.03)
     nominal = np.sqrt(log_power_moments(jm.SpectrumSettings().degrees_of_freedom(segments))[1])
@@ -109,29 +148,48 @@ def test_statistics_are_those_of_measured_log_powers(corner):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "tapers"), [("slow", ["hann"]), ("multitaper", scipy.signal.windows.dpss(1000, 2, 3))])
+@pytest.mark.parametrize(
+    ("name", "tapers"), [("slow", ["hann"]), ("multitaper", scipy.signal.windows.dpss(1000, 2, 3))]
+)
 def test_the_law_of_long_segments_is_that_of_coloured_noise(name, tapers):
-    """Noise that falls from 0.9 Hz on, stationary from its first sample: spread of the bins, correlation of neighbours."""
+    """Noise that falls from 0.9 Hz on, stationary from its first sample: spread of the bins,
+    correlation of neighbours."""
     settings, segments, a = jm.SpectrumSettings.named(name), 3, np.exp(-2 * np.pi * 0.9 / 100)
-    white = np.random.default_rng(7).standard_normal((1500, 2000)) * np.r_[1, np.full(1999, np.sqrt(1 - a**2))]
+    white = (
+        np.random.default_rng(7).standard_normal((1500, 2000))
+        * np.r_[1, np.full(1999, np.sqrt(1 - a**2))]
+    )
     signals = scipy.signal.lfilter([1], [1, -a], white)
-    power = np.mean([scipy.signal.welch(signals, 100, w, 1000, 500, detrend="linear")[1] for w in tapers], axis=0)
+    power = np.mean(
+        [scipy.signal.welch(signals, 100, w, 1000, 500, detrend="linear")[1] for w in tapers],
+        axis=0,
+    )
     power = power[:, settings.first_bin : settings.last_bin + 1]
     statistics = bin_statistics(jm.Target(name, power[0], segments=segments, settings=settings))
     log, step = np.log(power), 4 * len(tapers)  # bins so far apart are independent
     for bins in (slice(0, 1), slice(1, 2), slice(2, None)):
-        found, stated = (np.sqrt(np.mean(x)) for x in (log[:, bins].var(axis=0, ddof=1), statistics.sd[bins] ** 2))
+        found, stated = (
+            np.sqrt(np.mean(x))
+            for x in (log[:, bins].var(axis=0, ddof=1), statistics.sd[bins] ** 2)
+        )
         independent = 1500 * max(1, len(log[0, bins]) // step)
-        assert abs(found / stated - 1) < 4 * np.sqrt((1 + 3 / statistics.half.min()) / 2 / independent) + 0.03
+        assert (
+            abs(found / stated - 1)
+            < 4 * np.sqrt((1 + 3 / statistics.half.min()) / 2 / independent) + 0.03
+        )
     # What the degrees of freedom are without detrending and leakage.
-    np.testing.assert_allclose(2 * statistics.half[20:], settings.degrees_of_freedom(segments), rtol=1e-3)
+    np.testing.assert_allclose(
+        2 * statistics.half[20:], settings.degrees_of_freedom(segments), rtol=1e-3
+    )
     law, x = (
         welch_law(settings, np.arange(settings.first_bin, 118), (segments,)),
         power[:, 6:] / power[:, 6:].mean(axis=0) - 1,
     )
     variance = np.mean(x[:, :-3] ** 2, axis=1)
     excess = [
-        np.mean(x[:, :-3] * x[:, d : d - 3 or None], axis=1) - law.correlation[20, 20 + d] * variance for d in (1, 2, 3)
+        np.mean(x[:, :-3] * x[:, d : d - 3 or None], axis=1)
+        - law.correlation[20, 20 + d] * variance
+        for d in (1, 2, 3)
     ]
     references.assert_standard_normal([q.mean() / scipy.stats.sem(q) for q in excess])
 
@@ -141,7 +199,8 @@ def test_statistics_of_several_trials_add_their_degrees_of_freedom():
     nu = welch_law(jm.SpectrumSettings(), BINS, (6,)).degrees
     np.testing.assert_allclose(one.sd**2, log_power_moments(nu)[1])
     np.testing.assert_allclose(three.sd**2, log_power_moments(3 * nu)[1])
-    # Far from each other two bins have about 1e-31 in common, which is rounding and differs between processors.
+    # Far from each other two bins have about 1e-31 in common, which is rounding and differs between
+    # processors.
     np.testing.assert_allclose(three.correlation, one.correlation, atol=1e-15)
 
 
@@ -153,7 +212,9 @@ def test_a_line_does_not_scatter(overlap):
     settings = jm.SpectrumSettings(overlap=overlap)
     samples = settings.length + (segments - 1) * settings.step
     rng = np.random.default_rng(5)
-    sine = np.sin(2 * np.pi * k / settings.length * np.arange(samples) + rng.uniform(0, 2 * np.pi, (4000, 1)))
+    sine = np.sin(
+        2 * np.pi * k / settings.length * np.arange(samples) + rng.uniform(0, 2 * np.pi, (4000, 1))
+    )
     line = welch_powers(sine[:1], settings)[0, k - 1]
     amplitude = np.sqrt(share / (1 - share) * (2 / settings.rate) / line)
     power = welch_powers(amplitude * sine + rng.standard_normal(sine.shape), settings)[:, k - 1]
@@ -162,15 +223,23 @@ def test_a_line_does_not_scatter(overlap):
     other = np.arange(30) != k - 1
     with_line, without = bin_statistics(target, np.where(other, 0.0, share)), bin_statistics(target)
     bias, variance = with_line.bias[k - 1], with_line.sd[k - 1] ** 2
-    np.testing.assert_allclose(variance, log_power_moments(2 * without.half[k - 1] / (1 - share**2))[1])
+    np.testing.assert_allclose(
+        variance, log_power_moments(2 * without.half[k - 1] / (1 - share**2))[1]
+    )
     np.testing.assert_array_equal(with_line.sd[other], without.sd[other])
-    # The formula is the first order in 1/ν. Where segments overlap, their products with the line correlate by 1/6,
-    # not by its square: the variance is then up to 1.31 / 1.05 times as large.
+    # The formula is the first order in 1/ν. Where segments overlap, their products with the line
+    # correlate by 1/6, not by its square: the variance is then up to 1.31 / 1.05 times as large.
     second_order = 2 / settings.degrees_of_freedom(segments) ** 2
     excess = 1.0 if overlap == 0 else (1 + 11 / 12 / 3) / (1 + 11 / 12 / 18)
     error = 4 * scipy.stats.sem((log - log.mean()) ** 2)
-    assert -second_order - error < log.var() - variance < (excess - 1) * variance + second_order + error
-    assert abs(log.mean() - bias) < (excess - 1) * abs(bias) + second_order + 4 * scipy.stats.sem(log)
+    assert (
+        -second_order - error
+        < log.var() - variance
+        < (excess - 1) * variance + second_order + error
+    )
+    assert abs(log.mean() - bias) < (excess - 1) * abs(bias) + second_order + 4 * scipy.stats.sem(
+        log
+    )
 
 
 def test_statistics_from_sigma_and_from_nothing():
@@ -201,7 +270,9 @@ def test_standardised_does_not_see_scale():
     rng = np.random.default_rng(0)
     p, q = rng.uniform(1, 2, (2, 30))
     statistics = bin_statistics(jm.Target("t", FLAT, segments=12))
-    np.testing.assert_allclose(standardised(7 * p, q, statistics), standardised(p, q, statistics), atol=1e-12)
+    np.testing.assert_allclose(
+        standardised(7 * p, q, statistics), standardised(p, q, statistics), atol=1e-12
+    )
 
 
 def test_shares_map_is_the_derivative_of_proportional_power():
@@ -211,12 +282,15 @@ def test_shares_map_is_the_derivative_of_proportional_power():
         return np.exp(log) / np.exp(log).sum()
 
     h = 1e-6
-    slopes = np.stack([(shares(log + h * e) - shares(log - h * e)) / (2 * h) for e in np.eye(5)], axis=1)
+    slopes = np.stack(
+        [(shares(log + h * e) - shares(log - h * e)) / (2 * h) for e in np.eye(5)], axis=1
+    )
     np.testing.assert_allclose(shares_map(shares(log)), slopes, atol=h)
 
 
 def test_parameter_covariance_is_the_scatter_of_penalised_fits():
-    """Truths drawn from the prior, data with correlated errors; one direction that nothing but the prior holds."""
+    """Truths drawn from the prior, data with correlated errors; one direction that nothing but the
+    prior holds."""
     rng = np.random.default_rng(6)
     jacobian = rng.standard_normal((12, 4)) @ np.diag([5.0, 2.0, 1.0, 0.0])
     root = np.tril(rng.uniform(0.2, 1.0, (12, 12)))
@@ -241,7 +315,9 @@ def test_where_the_data_decide_the_covariance_is_that_of_least_squares():
     sigma = np.diag(rng.uniform(0.5, 2.0, 12))
     inverse = np.linalg.pinv(jacobian)
     # The prior enters with the ratio of its precision to that of the data, 1e-8.
-    np.testing.assert_allclose(parameter_covariance(jacobian, sigma, np.ones(3)), inverse @ sigma @ inverse.T, rtol=1e-6)
+    np.testing.assert_allclose(
+        parameter_covariance(jacobian, sigma, np.ones(3)), inverse @ sigma @ inverse.T, rtol=1e-6
+    )
 
 
 def jacobian_without(*nulls, strength=10.0, residuals=12):
@@ -265,7 +341,10 @@ MECHANICAL = direction(k_w=1, k_z=1, c_w=1, c_z=1)
         ([PERTURBED], [PERTURBATION]),
         ([MECHANICAL], [MECHANICS]),
         ([PERTURBED, MECHANICAL], [PERTURBATION, MECHANICS]),
-        ([np.add(PERTURBED, MECHANICAL), np.subtract(PERTURBED, MECHANICAL)], [PERTURBATION, MECHANICS]),
+        (
+            [np.add(PERTURBED, MECHANICAL), np.subtract(PERTURBED, MECHANICAL)],
+            [PERTURBATION, MECHANICS],
+        ),
         ([direction(harmonic_frequency=1)], []),
         ([PERTURBED, direction(k_z=1)], [PERTURBATION]),
         ([direction(noise_K_w=2, noise_K_z=1)], []),
@@ -285,12 +364,18 @@ def test_common_scales_are_told_in_words(nulls, sentences):
         ([direction(k_w=1, c_z=-1)], [*(n for n in NAMES if n not in ("k_w", "c_z")), "k_w c_z"]),
         (
             [MECHANICAL],
-            [*(n for n in NAMES if n not in ("k_w", "k_z", "c_w", "c_z")), "k_w / k_z", "k_w / c_w", "k_w / c_z"],
+            [
+                *(n for n in NAMES if n not in ("k_w", "k_z", "c_w", "c_z")),
+                "k_w / k_z",
+                "k_w / c_w",
+                "k_w / c_z",
+            ],
         ),
     ],
 )
 def test_what_is_known_is_told_as_the_simplest_products_and_ratios(nulls, known):
-    """Whatever basis of the null space rounding chooses; as many as there are determined directions."""
+    """Whatever basis of the null space rounding chooses; as many as there are determined
+    directions."""
     found = identifiability(jacobian_without(*nulls))
     positive, sd = np.ones(len(NAMES), dtype=bool), np.ones(len(NAMES))
     said = known_products(NAMES, positive, sd, found)
@@ -298,7 +383,9 @@ def test_what_is_known_is_told_as_the_simplest_products_and_ratios(nulls, known)
     turned = np.linalg.qr(np.random.default_rng(3).standard_normal((8, 8)))[0]
     kept = found.determined
     turned = turned[: kept.sum(), : kept.sum()] @ found.directions[kept]
-    again = found._replace(directions=np.concatenate([np.linalg.qr(turned.T)[0].T, found.directions[~kept]]))
+    again = found._replace(
+        directions=np.concatenate([np.linalg.qr(turned.T)[0].T, found.directions[~kept]])
+    )
     assert list(known_products(NAMES, positive, sd, again)) == known
     for slope in said.values():
         assert found.left(slope) == pytest.approx(1 / 101)
@@ -306,8 +393,11 @@ def test_what_is_known_is_told_as_the_simplest_products_and_ratios(nulls, known)
 
 @pytest.mark.parametrize(("strength", "told"), [(5.0, True), (10.0, False)])
 def test_a_common_scale_is_named_if_moving_along_it_is_not_noticed(strength, told):
-    """15 % of its square lies in directions of that steepness: 5 √0.15 = 1.9, 10 √0.15 = 3.9 standard deviations."""
-    flat = np.sqrt(0.85) * np.array(MECHANICAL) / 2 + np.sqrt(0.15) * np.array(direction(noise_K_w=-1))
+    """15 % of its square lies in directions of that steepness: 5 √0.15 = 1.9, 10 √0.15 = 3.9
+    standard deviations."""
+    flat = np.sqrt(0.85) * np.array(MECHANICAL) / 2 + np.sqrt(0.15) * np.array(
+        direction(noise_K_w=-1)
+    )
     found = identifiability(jacobian_without(flat, strength=strength))
     assert (MECHANICS in common_scales(NAMES, found)) is told
 
@@ -320,7 +410,9 @@ def test_nothing_is_told_where_all_is_determined():
 
 def test_identifiable_are_the_parameters_outside_the_flat_directions():
     found = identifiability(jacobian_without(PERTURBED, MECHANICAL))
-    assert [name for name, known in zip(NAMES, found.parameters, strict=True) if known] == ["harmonic_frequency"]
+    assert [name for name, known in zip(NAMES, found.parameters, strict=True) if known] == [
+        "harmonic_frequency"
+    ]
     np.testing.assert_allclose(found.singular_values, [10] * 6 + [0, 0], atol=1e-12)
 
 
@@ -332,7 +424,8 @@ def test_a_direction_is_determined_from_a_singular_value_of_three(value, determi
 
 @pytest.mark.parametrize(("share", "determined"), [(0.099, True), (0.101, False)])
 def test_one_criterion_at_most_a_tenth_of_the_prior_variance_is_left(share, determined):
-    """A flat direction that holds a share of a parameter leaves that share of its prior's variance."""
+    """A flat direction that holds a share of a parameter leaves that share of its prior's
+    variance."""
     flat = np.array([np.sqrt(share), np.sqrt(1 - share)])
     found = identifiability(1e6 * (np.eye(2) - np.outer(flat, flat)))
     np.testing.assert_array_equal(found.parameters, [determined, False])
@@ -341,7 +434,8 @@ def test_one_criterion_at_most_a_tenth_of_the_prior_variance_is_left(share, dete
 
 
 def test_correlated_bins_count_for_less():
-    """The covariance of a parameter seen by two bins of correlation 0.6, against the same as if independent."""
+    """The covariance of a parameter seen by two bins of correlation 0.6, against the same as if
+    independent."""
     jacobian = np.array([[2.0], [2.0]])
     scatter = np.array([[1.0, 0.6], [0.6, 1.0]])
     left = parameter_covariance(jacobian, scatter, np.ones(1))

@@ -1,4 +1,5 @@
-"""Identifiability reports: Fisher information against differences, draws and fits; designs keep what they promise."""
+"""Identifiability reports: Fisher information against differences, draws and fits; designs keep
+what they promise."""
 
 import dataclasses
 import functools
@@ -32,35 +33,62 @@ from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._bin_law import samples_of, welch_law
 from jaxmuscle.spectra._settings import WINDOW
 from jaxmuscle.uncertainty import _identifiability
-from jaxmuscle.uncertainty._design_information import design_information, information_of, seen_here, without_further
+from jaxmuscle.uncertainty._design_information import (
+    design_information,
+    information_of,
+    seen_here,
+    without_further,
+)
 
 TRUTH = jm.Isometric().replace(harmonic_amplitude=0.012, harmonic_frequency=5.0)
 LOADED = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)
 SEGMENTS = 24
 LEVELS = ("a second force level 2 times as high", "a second force level 0.5 times as high")
-MOVED = ["60 s with the insertion moved by 0.1 mm rms to 10 Hz", "60 s with the insertion moved by 1 mm rms to 5 Hz"]
+MOVED = [
+    "60 s with the insertion moved by 0.1 mm rms to 10 Hz",
+    "60 s with the insertion moved by 1 mm rms to 5 Hz",
+]
 AMPLITUDES = ("noise_K_w", "noise_K_z", "harmonic_amplitude")
-# Central differences with this step of a logarithm: truncation and rounding leave five digits of a slope.
+# Central differences with this step of a logarithm: truncation and rounding leave five digits of a
+# slope.
 STEP, DIGITS = 2e-5, 1e-5
 DOUBTFUL = 1e-3  # chance of a test to fail by scatter alone, over all it compares
 
 
-def fitted(task=TRUTH, free=DEFAULT_FREE, settings: dict[str, Any] | None = None, **target: Any) -> jm.fits.FitResult:
-    """What a fit would give that found `task`, its target being the expected spectrum; nothing is fitted."""
+def fitted(
+    task=TRUTH, free=DEFAULT_FREE, settings: dict[str, Any] | None = None, **target: Any
+) -> jm.fits.FitResult:
+    """What a fit would give that found `task`, its target being the expected spectrum; nothing is
+    fitted."""
     power = np.asarray(jm.expected_spectrum(task).proportional)
     quantity = "displacement" if task.output_unit == "m" else "force"
-    made = jm.Target("made", power, quantity=quantity, **({"segments": SEGMENTS, "settings": task.settings} | target))
+    made = jm.Target(
+        "made",
+        power,
+        quantity=quantity,
+        **({"segments": SEGMENTS, "settings": task.settings} | target),
+    )
     table = {
-        "free": list(free), "residual": "log", "mean_force": None, "bounds": {}, "starts": 1, "dt": 1e-3,
-        "prior_centre": {n: float(task[n]) for n in free}, "prior_sd": {n: PARAMETERS[n].prior_sd for n in free},
+        "free": list(free),
+        "residual": "log",
+        "mean_force": None,
+        "bounds": {},
+        "starts": 1,
+        "dt": 1e-3,
+        "prior_centre": {n: float(task[n]) for n in free},
+        "prior_sd": {n: PARAMETERS[n].prior_sd for n in free},
         "coefficient_of_variation": made.coefficient_of_variation is not None,
-    }  # fmt: skip
-    return made_result(task=task, target=made, fitted=power, settings=table | (settings or {}), notices=())
+    }
+    return made_result(
+        task=task, target=made, fitted=power, settings=table | (settings or {}), notices=()
+    )
 
 
 def moments_of(task):
     with jax.enable_x64(True):
-        found = expected_moments(as_arrays(task), task.settings, WINDOW, samples_of(SEGMENTS, task.settings))[0]
+        found = expected_moments(
+            as_arrays(task), task.settings, WINDOW, samples_of(SEGMENTS, task.settings)
+        )[0]
         return type(found)(*(np.asarray(x) for x in found))
 
 
@@ -68,13 +96,16 @@ def slopes(task, read, free=DEFAULT_FREE, step=STEP):
     """d read / d ln parameter by central differences."""
     columns = []
     for name in free:
-        up, down = (task.replace(**{name: float(task[name]) * np.exp(side * step)}) for side in (1, -1))
+        up, down = (
+            task.replace(**{name: float(task[name]) * np.exp(side * step)}) for side in (1, -1)
+        )
         columns.append((read(moments_of(up)) - read(moments_of(down))) / (2 * step))
     return np.stack(columns, axis=-1)
 
 
 def proportional_information(task, segments, free=DEFAULT_FREE):
-    """Fisher information of proportional powers by contrasts of their logarithms, which know nothing of the total."""
+    """Fisher information of proportional powers by contrasts of their logarithms, which know
+    nothing of the total."""
     moments = moments_of(task)
     law = welch_law(task.settings, np.arange(1, 31), segments)
     keep = 1 - (moments.line / moments.power) ** 2
@@ -96,7 +127,9 @@ def setup_at(result, target=None):
 def same_information(found, expected):
     """Equal to the digits of a difference, relative to the roots of the diagonal."""
     size = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=DIGITS)
+    np.testing.assert_allclose(
+        found / np.outer(size, size), expected / np.outer(size, size), atol=DIGITS
+    )
 
 
 # --- the information of the data
@@ -105,14 +138,20 @@ def same_information(found, expected):
 @pytest.mark.slow
 def test_the_information_is_that_of_log_contrasts(x64):
     problem, theta = setup_at(fitted())
-    same_information(information_of(problem, seen_here(problem, theta)), proportional_information(TRUTH, (SEGMENTS,)))
+    same_information(
+        information_of(problem, seen_here(problem, theta)),
+        proportional_information(TRUTH, (SEGMENTS,)),
+    )
 
 
 @pytest.mark.slow
 def test_a_coefficient_of_variation_adds_its_gradient(x64):
     result = fitted(coefficient_of_variation=0.015)
     problem, theta = setup_at(result)
-    row = slopes(TRUTH, lambda m: 0.5 * np.log(m.variance) - np.log(m.mean), step=0.2 * STEP) / problem.parts[0].variation[1]
+    row = (
+        slopes(TRUTH, lambda m: 0.5 * np.log(m.variance) - np.log(m.mean), step=0.2 * STEP)
+        / problem.parts[0].variation[1]
+    )
     expected = proportional_information(TRUTH, (SEGMENTS,)) + np.outer(row, row)
     same_information(information_of(problem, seen_here(problem, theta)), expected)
 
@@ -120,22 +159,28 @@ def test_a_coefficient_of_variation_adds_its_gradient(x64):
 def test_eliminating_the_offset_is_inverting_with_it():
     root = np.random.default_rng(0).standard_normal((5, 9))
     whole = root @ root.T
-    np.testing.assert_allclose(np.linalg.inv(without_offsets(whole, len(whole) - 1)), np.linalg.inv(whole)[:-1, :-1])
+    np.testing.assert_allclose(
+        np.linalg.inv(without_offsets(whole, len(whole) - 1)), np.linalg.inv(whole)[:-1, :-1]
+    )
     whole[-1], whole[:, -1] = 0, 0
     np.testing.assert_array_equal(without_offsets(whole, len(whole) - 1), whole[:-1, :-1])
 
 
 def drawn(task, segments, count, seed):
-    """Proportional powers drawn from the bins' law about the expected spectrum of a task. Needs float64."""
+    """Proportional powers drawn from the bins' law about the expected spectrum of a task. Needs
+    float64."""
     moments, law = moments_of(task), welch_law(task.settings, np.arange(1, 31), segments)
     a = law.degrees / 2 / (1 - (moments.line / moments.power) ** 2)
-    normal = np.random.default_rng(seed).multivariate_normal(np.zeros(30), law.correlation, size=count)
+    normal = np.random.default_rng(seed).multivariate_normal(
+        np.zeros(30), law.correlation, size=count
+    )
     power = moments.power * gammaincinv(a, ndtr(normal)) / a
     return power / power.sum(axis=1, keepdims=True)
 
 
 def highest_posteriors(result, count):
-    """Derived quantities at the posterior's maxima for spectra drawn at the fit, and those of the fit with their slopes."""
+    """Derived quantities at the posterior's maxima for spectra drawn at the fit, and those of the
+    fit with their slopes."""
     problem, theta = setup_at(result)
     likelihood = Likelihood.of(problem)
     powers = drawn(result.task, result.target.segments, count, 3)
@@ -146,7 +191,12 @@ def highest_posteriors(result, count):
     objective = without_further(problem).linear()
     (values,), _ = quantities(objective, expand(objective, peak.theta))
     (truth,), (gradients,) = quantities(objective, expand(objective, theta[None]))
-    return peak, values, {n: float(v[0]) for n, v in truth.items()}, {n: g[0] for n, g in gradients.items()}
+    return (
+        peak,
+        values,
+        {n: float(v[0]) for n, v in truth.items()},
+        {n: g[0] for n, g in gradients.items()},
+    )
 
 
 @pytest.mark.slow
@@ -160,13 +210,19 @@ def test_where_all_is_determined_maxima_scatter_by_the_inverse_information(x64):
     peak, *_ = highest_posteriors(result, count)
     information = proportional_information(TRUTH, (6 * SEGMENTS,), free)
     gain = np.linalg.inv(information + np.eye(4))
-    predicted = gain @ information @ gain  # about one truth, the prior's centre, which pulls but does not scatter
+    # about one truth, the prior's centre, which pulls but does not scatter
+    predicted = gain @ information @ gain
     off = peak.theta - peak.theta.mean(axis=0)
     scatter = np.linalg.solve(np.linalg.cholesky(predicted), off.T)
     eigenvalues = np.linalg.eigvalsh(scatter @ scatter.T / (count - 1))
     # Outermost eigenvalues of a white Wishart matrix by simulation.
     rng = np.random.default_rng(1)
-    white = np.array([np.linalg.eigvalsh(np.cov(rng.standard_normal((4, count))))[[0, -1]] for _ in range(20_000)])
+    white = np.array(
+        [
+            np.linalg.eigvalsh(np.cov(rng.standard_normal((4, count))))[[0, -1]]
+            for _ in range(20_000)
+        ]
+    )
     low, high = np.quantile(white[:, 0], DOUBTFUL / 2), np.quantile(white[:, 1], 1 - DOUBTFUL / 2)
     assert low < eigenvalues[0] and eigenvalues[-1] < high
     for i, name in enumerate(free):
@@ -183,7 +239,12 @@ def test_determined_quantities_scatter_as_the_report_says(x64):
     information = proportional_information(TRUTH, (SEGMENTS,))
     gain = np.linalg.inv(information + np.eye(8))
     determined = [n for n, k in present.quantities.items() if k.determined and n in values]
-    assert {"corner_frequency", "harmonic_share", "harmonic_frequency", "high_frequency_floor"} <= set(determined)
+    assert {
+        "corner_frequency",
+        "harmonic_share",
+        "harmonic_frequency",
+        "high_frequency_floor",
+    } <= set(determined)
     for name in determined:
         g, found = gradients[name], values[name]
         known = present.quantities[name]
@@ -191,9 +252,11 @@ def test_determined_quantities_scatter_as_the_report_says(x64):
         expected = g @ gain @ information @ gain @ g
         assert expected <= known.stderr**2 * (1 + 1e-9)
         centred = found - found.mean()
-        scatter = np.sqrt((np.mean(centred**4) / np.mean(centred**2) ** 2 - 1) / count)  # of the variance, relative
+        # of the variance, relative
+        scatter = np.sqrt((np.mean(centred**4) / np.mean(centred**2) ** 2 - 1) / count)
         bound = scipy.stats.norm.ppf(1 - DOUBTFUL / 2 / len(determined)) * scatter
-        # The corner frequency is curved along what is open: its errors are a fifth larger than to first order.
+        # The corner frequency is curved along what is open: its errors are a fifth larger than to
+        # first order.
         curved = 0.45 if name == "corner_frequency" else 0.0
         assert -bound < np.mean(centred**2) / expected - 1 < bound + curved, name
         assert abs(found.mean() - truth[name]) < 0.5 * known.stderr
@@ -207,7 +270,8 @@ def test_a_longer_recording_multiplies_the_information():
     degrees = [jm.SpectrumSettings().degrees_of_freedom(k) for k in (SEGMENTS, 9 * SEGMENTS)]
     shown = report.present.singular_values > 1e-2  # below, rounding
     ratio = report.designs[0].singular_values[shown] / report.present.singular_values[shown]
-    # The law of bins knows of leakage into the lowest ones, the equivalent degrees of freedom do not.
+    # The law of bins knows of leakage into the lowest ones, the equivalent degrees of freedom do
+    # not.
     np.testing.assert_allclose(ratio, np.sqrt(sum(degrees) / degrees[0]), rtol=2e-3)
 
 
@@ -232,7 +296,10 @@ def test_a_known_mean_is_known_as_well_as_it_was_measured():
     report = jm.identifiability(fitted(), designs=[jm.Design("the mean", segments=0, mean=0.02)])
     mean = report.designs[0].quantities["mean"]
     # The prior adds next to nothing: its own error is 79 %.
-    assert mean.stderr / mean.value == pytest.approx(0.02, rel=1e-3) and "mean" in report.designs[0].gained
+    assert (
+        mean.stderr / mean.value == pytest.approx(0.02, rel=1e-3)
+        and "mean" in report.designs[0].gained
+    )
 
 
 @pytest.mark.slow
@@ -261,7 +328,9 @@ def test_separate_parameters_are_eliminated(x64):
     whole[np.ix_(where, where)] += tied
     expected = np.linalg.inv(whole)[:8, :8]
     # Condition number 1e11: the scale of the amplitudes by themselves is not in the data.
-    np.testing.assert_allclose(np.linalg.inv(present + loose + np.eye(8)), expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.inv(present + loose + np.eye(8)), expected, rtol=0, atol=1e-5
+    )
     # Less is known than if they were shared, in every direction.
     assert np.linalg.eigvalsh(tied - loose)[0] > -1e-9 * np.abs(tied).max()
 
@@ -280,16 +349,39 @@ def test_the_load_keeps_the_operating_point(x64):
 @pytest.mark.parametrize(
     ("result", "names"),
     [
-        (lambda: fitted(), ["the coefficient of variation", "the mean force, known to 2 %",
-                            "the displacement under a load of 2.18 N", *MOVED, *LEVELS, "a recording 10 times as long"]),
-        (lambda: fitted(coefficient_of_variation=0.016, settings={"mean_force": [2.18, 0.05]}),
-         ["the displacement under a load of 2.18 N", *MOVED, *LEVELS, "a recording 10 times as long"]),
-        (lambda: fitted(jm.PrescribedForce(F_ext=1.0)),
-         ["the coefficient of variation", "the mean displacement, known to 2 %", "the force with the insertion held",
-          *LEVELS, "a recording 10 times as long"]),
+        (
+            lambda: fitted(),
+            [
+                "the coefficient of variation",
+                "the mean force, known to 2 %",
+                "the displacement under a load of 2.18 N",
+                *MOVED,
+                *LEVELS,
+                "a recording 10 times as long",
+            ],
+        ),
+        (
+            lambda: fitted(coefficient_of_variation=0.016, settings={"mean_force": [2.18, 0.05]}),
+            [
+                "the displacement under a load of 2.18 N",
+                *MOVED,
+                *LEVELS,
+                "a recording 10 times as long",
+            ],
+        ),
+        (
+            lambda: fitted(jm.PrescribedForce(F_ext=1.0)),
+            [
+                "the coefficient of variation",
+                "the mean displacement, known to 2 %",
+                "the force with the insertion held",
+                *LEVELS,
+                "a recording 10 times as long",
+            ],
+        ),
     ],
     ids=["isometric", "all numbers known", "force"],
-)  # fmt: skip
+)
 @pytest.mark.slow
 def test_the_usual_designs(result, names):
     designs = jm.standard_designs(result())
@@ -301,14 +393,24 @@ def test_the_usual_designs(result, names):
 @pytest.mark.slow
 def test_the_usual_designs_of_a_motion(monkeypatch):
     """They follow from its moments alone: slopes are not compiled for this task."""
-    monkeypatch.setattr(_identifiability, "seen_here",
-                        lambda problem, theta: Expansion(theta, (moments_of(problem.parts[0].task),), None))  # fmt: skip
+    monkeypatch.setattr(
+        _identifiability,
+        "seen_here",
+        lambda problem, theta: Expansion(theta, (moments_of(problem.parts[0].task),), None),
+    )
     names = [design.name for design in jm.standard_designs(fitted(jm.PrescribedMotion(F_ext=8.0)))]
-    assert names == ["the coefficient of variation", "the mean force, known to 2 %", *LEVELS, "a recording 10 times as long"]
+    assert names == [
+        "the coefficient of variation",
+        "the mean force, known to 2 %",
+        *LEVELS,
+        "a recording 10 times as long",
+    ]
 
 
 def test_no_design_is_above_the_maximal_force():
-    names = [[d.name for d in jm.standard_designs(fitted(mvc_fraction=level))] for level in (0.5, 0.6)]
+    names = [
+        [d.name for d in jm.standard_designs(fitted(mvc_fraction=level))] for level in (0.5, 0.6)
+    ]
     assert set(names[0]) - set(names[1]) == {LEVELS[0]} and LEVELS[1] in names[1]
 
 
@@ -330,8 +432,11 @@ def test_the_report_agrees_with_itself():
         for name, known in outlook.quantities.items():
             assert known.determined is (known.left**2 <= 0.1), name
             assert known.left <= found.present.quantities[name].left * (1 + 1e-9)
-        assert set(outlook.gained) == {n for n, k in outlook.quantities.items()
-                                       if k.determined and not found.present.quantities[n].determined}  # fmt: skip
+        assert set(outlook.gained) == {
+            n
+            for n, k in outlook.quantities.items()
+            if k.determined and not found.present.quantities[n].determined
+        }
     for pair in found.pairs:
         parts = [d for d in found.designs if d.name in pair.name.split(" together with ")]
         assert len(parts) == 2
@@ -339,7 +444,9 @@ def test_the_report_agrees_with_itself():
             assert known.left <= min(part.quantities[name].left for part in parts) * (1 + 1e-9)
     gains = [len(pair.gained) for pair in found.pairs]
     assert gains == sorted(gains, reverse=True)
-    alone, together = (max((d.determined, len(d.gained)) for d in each) for each in (found.designs, found.pairs))
+    alone, together = (
+        max((d.determined, len(d.gained)) for d in each) for each in (found.designs, found.pairs)
+    )
     single = f"If you make only one: {'ABCDEFG'[np.argmax([d.determined for d in found.designs])]}"
     assert (single in " ".join(str(found).split())) is (together > alone)
 
@@ -360,12 +467,20 @@ def test_the_report_in_words():
     displacement = report().designs[1]
     percent = displacement.quantities["K_w0"].percent
     said = " ".join(text.split())
-    assert "the displacement under a load of 2.18 N would determine" in said and f"K_w0 to {percent}" in said
+    assert (
+        "the displacement under a load of 2.18 N would determine" in said
+        and f"K_w0 to {percent}" in said
+    )
     assert "with its own values of noise_K_w, noise_K_z, harmonic_amplitude" in said
     assert "k_w to" not in said  # K_w0 says it
-    assert said.count("mm rms to 5 Hz: 1 of 8 combinations would stay open") == 1  # the answer, before its details
-    parts = ("what to measure next: most would be learnt from D, 60 s", "fatigue is not considered", "standard errors in",
-             "the measurements in detail")  # fmt: skip
+    # the answer, before its details
+    assert said.count("mm rms to 5 Hz: 1 of 8 combinations would stay open") == 1
+    parts = (
+        "what to measure next: most would be learnt from D, 60 s",
+        "fatigue is not considered",
+        "standard errors in",
+        "the measurements in detail",
+    )
     assert [said.index(part) for part in parts] == sorted(said.index(part) for part in parts)
     for sentence in report().present.undetermined:
         assert sentence in said
@@ -373,39 +488,66 @@ def test_the_report_in_words():
 
 def test_the_report_names_what_it_knows_and_the_fit_does_not():
     sure, unsure = jm.fits.Estimate(1.0, "Hz", 0.1), jm.fits.Estimate(1.0, "Hz", None, True, False)
-    quantities = {"corner_frequency": sure, "harmonic_share": unsure, "K_w0": unsure, "mean": unsure}
-    result = eqx.tree_at(lambda r: r.derived, fitted(), quantities, is_leaf=lambda x: isinstance(x, dict))
+    quantities = {
+        "corner_frequency": sure,
+        "harmonic_share": unsure,
+        "K_w0": unsure,
+        "mean": unsure,
+    }
+    result = eqx.tree_at(
+        lambda r: r.derived, fitted(), quantities, is_leaf=lambda x: isinstance(x, dict)
+    )
     found = jm.identifiability(result, designs=())
     known = found.present.quantities
     assert known["harmonic_share"].determined and not known["K_w0"].determined
-    assert "harmonic_share" in found.open_in_fit and not {"corner_frequency", "K_w0"} & set(found.open_in_fit)
+    assert "harmonic_share" in found.open_in_fit and not {"corner_frequency", "K_w0"} & set(
+        found.open_in_fit
+    )
     said = " ".join(str(found).split())
-    assert f"known here, but not determined in the fit: {', '.join(found.open_in_fit)}. The fit is stricter" in said
+    assert (
+        f"known here, but not determined in the fit: {', '.join(found.open_in_fit)}. The fit is"
+        " stricter" in said
+    )
     assert found.to_dict()["not_determined_in_fit"] == list(found.open_in_fit)
     # Neither the table nor the figure shows it as determined.
     row = next(line for line in str(found).splitlines() if line.split()[:1] == ["harmonic_share"])
     assert row.rstrip().endswith(")")
     figure = found.plot()
     (matrix,) = (ax for ax in figure.axes if "bold" in ax.get_title(loc="left"))
-    names = [tick.get_text().replace("\n", "").partition(" ")[0] for tick in matrix.get_yticklabels()]
-    bold = {names[int(cell.get_position()[1])]: cell.get_weight() == "bold" for cell in matrix.texts}
+    names = [
+        tick.get_text().replace("\n", "").partition(" ")[0] for tick in matrix.get_yticklabels()
+    ]
+    bold = {
+        names[int(cell.get_position()[1])]: cell.get_weight() == "bold" for cell in matrix.texts
+    }
     assert not bold["harmonic_share"] and bold["corner_frequency"]
     plt.close(figure)
-    other = jm.identifiability(result, result.target, designs=())  # of another target the fit has said nothing
+    # of another target the fit has said nothing
+    other = jm.identifiability(result, result.target, designs=())
     assert not other.open_in_fit and "not determined in the fit" not in str(other)
 
 
 @pytest.mark.slow
 def test_a_report_about_a_fit_that_misses_its_data_says_so_first():
     kept = fitted().adequacy
-    missing = eqx.tree_at(lambda r: r.adequacy, fitted(), kept._replace(chi2=4 * kept.expected, p=1e-4),
-                          is_leaf=lambda x: isinstance(x, type(kept)))  # fmt: skip
+    missing = eqx.tree_at(
+        lambda r: r.adequacy,
+        fitted(),
+        kept._replace(chi2=4 * kept.expected, p=1e-4),
+        is_leaf=lambda x: isinstance(x, type(kept)),
+    )
     found = jm.identifiability(missing, designs=())
-    assert missing.adequacy.widening == 2.0 and f"(chi2 {4 * kept.expected:.3g}, expected" in found.notices[0]
+    assert (
+        missing.adequacy.widening == 2.0
+        and f"(chi2 {4 * kept.expected:.3g}, expected" in found.notices[0]
+    )
     said = " ".join(str(found).split())
     assert "note: the fit does not describe its data" in said and "by a factor of 2" in said
     assert found.to_dict()["notices"][0] == found.notices[0]
-    for about in (jm.identifiability(fitted(), designs=()), jm.identifiability(missing, missing.target, designs=())):
+    for about in (
+        jm.identifiability(fitted(), designs=()),
+        jm.identifiability(missing, missing.target, designs=()),
+    ):
         assert "does not describe" not in str(about)
     motion = jm.design_input(missing, seconds=10.0, band=(0.5, 5.0), rate=50.0)
     assert motion.notices == found.notices[:1] == tuple(motion.to_dict()["notices"])
@@ -413,13 +555,16 @@ def test_a_report_about_a_fit_that_misses_its_data_says_so_first():
 
 
 def test_the_numbers_in_the_table_are_those_of_the_report():
-    first, second = (line.split() for line in str(report()).splitlines() if line.startswith("  K_w0  "))
+    first, second = (
+        line.split() for line in str(report()).splitlines() if line.startswith("  K_w0  ")
+    )
     known = [o.quantities["K_w0"] for o in (report().present, *report().designs)]
     assert first[2] == "1/m" and first[:5] == second[:5]
     cells = first[4:] + second[5:]
     assert [cell.startswith("(") for cell in cells] == [not k.determined for k in known]
     for cell, k in zip(cells, known, strict=True):
-        assert float(cell.strip("()")) == pytest.approx(100 * k.stderr / k.value, rel=0.06)  # two digits
+        # two digits
+        assert float(cell.strip("()")) == pytest.approx(100 * k.stderr / k.value, rel=0.06)
 
 
 def test_without_newtons_values_are_stated_per_newton_as_in_the_fit():
@@ -427,14 +572,17 @@ def test_without_newtons_values_are_stated_per_newton_as_in_the_fit():
     rows = {words[0]: words for words in map(str.split, str(found).splitlines()) if words}
     stiffness, mean = found.present.quantities["K_w0"], fitted().derived["mean"]
     assert (stiffness.unit, mean.unit) == ("N/m", "N")
-    assert float(rows["K_w0"][1]) == pytest.approx(stiffness.value / mean.value, rel=5e-3)  # three digits
+    # three digits
+    assert float(rows["K_w0"][1]) == pytest.approx(stiffness.value / mean.value, rel=5e-3)
     assert rows["K_w0"][2] == "1/m" and "per newton of mean force" in " ".join(str(found).split())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, -1])
 def test_of_designs_that_determine_as_much_the_one_with_smaller_errors_is_named(order):
-    lengthenings = [jm.uncertainty.Lengthening.flat(1e-3, (0.5, 5.0), seconds) for seconds in (30.0, 240.0)]
+    lengthenings = [
+        jm.uncertainty.Lengthening.flat(1e-3, (0.5, 5.0), seconds) for seconds in (30.0, 240.0)
+    ]
     moved = [jm.Design(f"{x.seconds:g} s", segments=0, lengthening=x) for x in lengthenings]
     found = jm.identifiability(fitted(), designs=moved[::order])
     short, long = found.designs[::order]
@@ -466,7 +614,9 @@ def test_the_figure():
         assert "K_w0" in names and "k_w" not in names
         texts = [text.get_text() for text in lower.texts]
         columns = len(texts) // len(names)
-        assert texts[names.index("K_z0") * columns + 2] == report().designs[1].quantities["K_z0"].percent.removesuffix(" %")
+        assert texts[names.index("K_z0") * columns + 2] == report().designs[1].quantities[
+            "K_z0"
+        ].percent.removesuffix(" %")
         assert [label.get_text() for label in lower.get_xticklabels()][:3] == ["now", "A", "B"]
         assert upper.get_xscale() == "log"
     finally:
@@ -476,7 +626,8 @@ def test_the_figure():
 def test_a_design_without_equilibrium_is_impossible_and_the_rest_goes_on():
     undamped = TRUTH.replace(c_w=0.0, c_z=0.0)
     found = jm.identifiability(
-        fitted(), designs=[jm.Design("undamped", undamped), jm.Design("the mean", segments=0, mean=0.02)]
+        fitted(),
+        designs=[jm.Design("undamped", undamped), jm.Design("the mean", segments=0, mean=0.02)],
     )
     assert found.designs[0].failed is not None and "undamped" in found.designs[0].failed
     assert found.designs[0].quantities["k_w"].stderr == found.present.quantities["k_w"].stderr
@@ -492,14 +643,19 @@ def test_a_target_with_a_sigma_only():
     found = jm.identifiability(fitted(segments=None, sigma=power * np.sqrt(2 / nu)))
     # Without correlation of the bins they tell more.
     assert found.present.determined >= 4
-    assert f"{SEGMENTS * 9} segments" in found.designs[-1].data and "30 bins with a stated sigma" in found.present.data
+    assert (
+        f"{SEGMENTS * 9} segments" in found.designs[-1].data
+        and "30 bins with a stated sigma" in found.present.data
+    )
 
 
 def test_another_target_can_be_given():
     result = fitted()
     longer = jm.Target("longer", result.fitted, segments=4 * SEGMENTS)
     a, b = (jm.identifiability(result, target, designs=()).present for target in (None, longer))
-    assert b.quantities["harmonic_share"].stderr == pytest.approx(0.5 * a.quantities["harmonic_share"].stderr, rel=0.03)
+    assert b.quantities["harmonic_share"].stderr == pytest.approx(
+        0.5 * a.quantities["harmonic_share"].stderr, rel=0.03
+    )
 
 
 @pytest.mark.parametrize(
@@ -507,15 +663,29 @@ def test_another_target_can_be_given():
     [
         (lambda: jm.Design("nothing", segments=0), "nothing: measures nothing: give segments"),
         (lambda: jm.Design("few", segments=-1), "few: segments = -1 must not be negative"),
-        (lambda: jm.Design("exact", mean=0.0), "exact: mean = 0.0 must be a positive relative standard error"),
-        (lambda: jm.identifiability(fitted(), designs=[jm.Design("a"), jm.Design("a")]), "two are called 'a'"),
-        (lambda: jm.identifiability(fitted(), designs=[jm.Design("a", separate=("m_w",))]),
-         "a: separate: 'm_w' is not free in the fit; free are k_w, "),
-        (lambda: jm.identifiability(fitted(), designs=[jm.Design("x", LOADED, mean=0.1)]), "x: the mean of its output is"),
+        (
+            lambda: jm.Design("exact", mean=0.0),
+            "exact: mean = 0.0 must be a positive relative standard error",
+        ),
+        (
+            lambda: jm.identifiability(fitted(), designs=[jm.Design("a"), jm.Design("a")]),
+            "two are called 'a'",
+        ),
+        (
+            lambda: jm.identifiability(fitted(), designs=[jm.Design("a", separate=("m_w",))]),
+            "a: separate: 'm_w' is not free in the fit; free are k_w, ",
+        ),
+        (
+            lambda: jm.identifiability(fitted(), designs=[jm.Design("x", LOADED, mean=0.1)]),
+            "x: the mean of its output is",
+        ),
         (lambda: jm.identifiability(fitted(segments=None)), "states neither segments nor sigma"),
-        (lambda: jm.identifiability(made_result(fitted=np.full(30, np.nan))), "the fit of made failed"),
+        (
+            lambda: jm.identifiability(made_result(fitted=np.full(30, np.nan))),
+            "the fit of made failed",
+        ),
     ],
-)  # fmt: skip
+)
 def test_bad_arguments(make, message):
     with pytest.raises(ValueError, match=message):
         make()
@@ -526,24 +696,38 @@ def test_bad_arguments(make, message):
 
 @pytest.mark.slow
 def test_a_design_keeps_its_promise(x64):
-    """Force and displacement drawn and fitted together 200 times: the spread is the report's prediction."""
+    """Force and displacement drawn and fitted together 200 times: the spread is the report's
+    prediction."""
     result, count = fitted(), 200
     promised = next(d for d in jm.identifiability(result).designs if "displacement" in d.name)
     assert {"K_w0", "K_z0", "C_w0", "C_z0"} <= set(promised.gained)
     held = next(d.task for d in jm.standard_designs(result) if "displacement" in d.name)
     tasks = {"force": TRUTH, "displacement": held}
-    targets = {name: jm.Target(name, np.asarray(jm.expected_spectrum(task).proportional), segments=SEGMENTS,
-                               quantity=name) for name, task in tasks.items()}  # fmt: skip
+    targets = {
+        name: jm.Target(
+            name,
+            np.asarray(jm.expected_spectrum(task).proportional),
+            segments=SEGMENTS,
+            quantity=name,
+        )
+        for name, task in tasks.items()
+    }
     problem = planned_jointly(tasks, targets, FitOptions()).problem
     theta = np.zeros(len(problem.coordinates.names))
     seen = expand(problem.linear(), theta[None])
     objective = problem.linear([np.asarray(m.line / m.power)[0] for m in seen.moments])
     drawings = [drawn(task, (SEGMENTS,), count, seed) for seed, task in enumerate(tasks.values())]
     data = tuple(
-        eqx.tree_at(lambda d: d.target, jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), one), powers)
+        eqx.tree_at(
+            lambda d: d.target,
+            jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), one),
+            powers,
+        )
         for one, powers in zip(objective.data, drawings, strict=True)
     )
-    found = least_squares(objective, np.tile(problem.coordinates.from_theta(theta), (count, 1)), 40, data=data)
+    found = least_squares(
+        objective, np.tile(problem.coordinates.from_theta(theta), (count, 1)), 40, data=data
+    )
     assert found.settled.mean() > 0.97
     reached = np.asarray(objective.theta(found.s))
     kept = [n for n in problem.coordinates.names if promised.quantities[n].determined]
@@ -552,8 +736,9 @@ def test_a_design_keeps_its_promise(x64):
     low, high = np.sqrt(scipy.stats.chi2.ppf([chance, 1 - chance], count - 1) / (count - 1))
     for name in kept:
         spread = reached[:, problem.coordinates.names.index(name)].std(ddof=1)
-        # Least squares of log powers scatters more than the information allows: ν/2 ψ'(ν/2) = 1.03 in variance, and 1.13
-        # for not weighing the correlation; the prior takes a tenth of the variance at most.
+        # Least squares of log powers scatters more than the information allows: ν/2 ψ'(ν/2) = 1.03
+        # in variance, and 1.13 for not weighing the correlation; the prior takes a tenth of the
+        # variance at most.
         assert 0.95 * low < spread / promised.quantities[name].left < 1.1 * high, name
 
 
@@ -563,10 +748,15 @@ def test_a_joint_fit_reports_the_promised_errors():
     promised = next(d for d in jm.identifiability(result).designs if "displacement" in d.name)
     held = next(d.task for d in jm.standard_designs(result) if "displacement" in d.name)
     power = np.asarray(jm.expected_spectrum(held).proportional)
-    targets = {"force": result.target, "displacement": jm.Target("x", power, segments=SEGMENTS, quantity="displacement")}
+    targets = {
+        "force": result.target,
+        "displacement": jm.Target("x", power, segments=SEGMENTS, quantity="displacement"),
+    }
     joint = jm.fit_joint(targets, tasks={"force": TRUTH, "displacement": held}, starts=4, seeds=0)
     for name in ("K_w0", "K_z0", "C_w0", "C_z0"):
-        assert joint.derived[name].stderr == pytest.approx(promised.quantities[name].stderr, rel=0.1)
+        assert joint.derived[name].stderr == pytest.approx(
+            promised.quantities[name].stderr, rel=0.1
+        )
 
 
 def test_pairs_add_up(x64):
@@ -576,6 +766,9 @@ def test_pairs_add_up(x64):
     found = jm.identifiability(fitted(), designs=designs).pairs
     present = information_of(problem, seen_here(problem, theta))
     both = present + sum(design_information(problem, theta, d) for d in designs)
-    np.testing.assert_allclose(found[0].singular_values**2, np.maximum(np.linalg.eigvalsh(both)[::-1], 0),
-                               atol=1e-9 * np.abs(both).max())  # fmt: skip
+    np.testing.assert_allclose(
+        found[0].singular_values ** 2,
+        np.maximum(np.linalg.eigvalsh(both)[::-1], 0),
+        atol=1e-9 * np.abs(both).max(),
+    )
     assert len(found) == len(list(itertools.combinations(designs, 2)))

@@ -1,4 +1,5 @@
-"""Designed motions: their information against closed forms and repeats, the optimum against its theorem, limits, files."""
+"""Designed motions: their information against closed forms and repeats, the optimum against its
+theorem, limits, files."""
 
 import functools
 import inspect
@@ -22,7 +23,12 @@ from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.uncertainty import Lengthening, _input_design
-from jaxmuscle.uncertainty._design_information import design_information, information_of, opened, seen_here
+from jaxmuscle.uncertainty._design_information import (
+    design_information,
+    information_of,
+    opened,
+    seen_here,
+)
 from jaxmuscle.uncertainty._identifiability import fitted_problem
 from jaxmuscle.uncertainty._identifiability_report import TOGETHER
 from jaxmuscle.uncertainty._input_design import Experiment, _named, steps_of
@@ -38,14 +44,22 @@ REPEATS, DOUBTFUL = 300, 1e-4  # chance of a test to fail by scatter alone
 
 def point(p):
     """x_w of the static equilibrium."""
-    static = lambda x: p["k_w"] * (p["x_ref_w"] ** 2 + x**2) * x + p["k_z"] * p["x_ref_z"] ** 2 * x - p["P_w"]  # noqa: E731
+
+    def static(x):
+        active, passive = p["k_w"] * (p["x_ref_w"] ** 2 + x**2), p["k_z"] * p["x_ref_z"] ** 2
+        return (active + passive) * x - p["P_w"]
+
     return scipy.optimize.brentq(static, 0.0, 1.0, xtol=1e-15)
 
 
 def parts(p, f):
     """(K_z + C_z s), the active tissue's impedance, their sum."""
     s = 2j * np.pi * f
-    active = p["m_w"] * s**2 + p["c_w"] * p["v_ref_w"] ** 2 * s + p["k_w"] * (p["x_ref_w"] ** 2 + 3 * point(p) ** 2)
+    active = (
+        p["m_w"] * s**2
+        + p["c_w"] * p["v_ref_w"] ** 2 * s
+        + p["k_w"] * (p["x_ref_w"] ** 2 + 3 * point(p) ** 2)
+    )
     passive = p["k_z"] * p["x_ref_z"] ** 2 + p["c_z"] * p["v_ref_z"] ** 2 * s
     return passive, active, active + passive
 
@@ -56,7 +70,8 @@ def stiffness(p, f):
 
 
 def density(p, f):
-    """One-sided, of noise on both stiffnesses, band-limited at 50 Hz by a second-order Butterworth filter."""
+    """One-sided, of noise on both stiffnesses, band-limited at 50 Hz by a second-order Butterworth
+    filter."""
     passive, _, both = parts(p, f)
     gains = passive / both, 1 - passive / both
     scales = [p[f"noise_K_{j}"] * p[f"k_{j}"] * p[f"x_ref_{j}"] ** 2 * point(p) for j in "wz"]
@@ -73,12 +88,16 @@ def changed(log_change):
 
 def slopes(f):
     """d H / d ln parameter by central differences."""
-    columns = [(stiffness(changed(STEP * e), f) - stiffness(changed(-STEP * e), f)) / (2 * STEP) for e in np.eye(4)]
+    columns = [
+        (stiffness(changed(STEP * e), f) - stiffness(changed(-STEP * e), f)) / (2 * STEP)
+        for e in np.eye(4)
+    ]
     return np.stack(columns, axis=-1)
 
 
 def information(lengthening):
-    """`Σ_k |∂F_k|² / (variance of real or imaginary part)`, F_k = DFT / samples, from white noise of known density."""
+    """`Σ_k |∂F_k|² / (variance of real or imaginary part)`, F_k = DFT / samples, from white noise
+    of known density."""
     f, ordinate = lengthening.frequency, np.sqrt(2 * lengthening.power) / 2
     rows = slopes(f) * ordinate[:, None]
     variance = density(VALUES, f) / (4 * lengthening.seconds)
@@ -93,21 +112,33 @@ def test_the_information_is_that_of_the_closed_form(x64):
     expected = information(lengthening)
     size = np.sqrt(np.diag(expected))
     found = lengthening.information(TRUTH, coordinates, np.zeros(4))
-    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-6)
+    np.testing.assert_allclose(
+        found / np.outer(size, size), expected / np.outer(size, size), atol=1e-6
+    )
 
 
 @pytest.mark.slow
 def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
-    """By hand: H also has m_z s², and slopes by m_w; of both ln masses the prior is known, and then they are left out."""
+    """By hand: H also has m_z s², and slopes by m_w; of both ln masses the prior is known, and then
+    they are left out."""
     problem, theta = fitted_problem(hold(), None)
     told, problem, theta = problem, opened(problem), np.append(theta, [0.0, 0.0])
     lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
-    moved = TRUTH if isinstance(TRUTH, jm.PrescribedLength) else TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
+    moved = (
+        TRUTH
+        if isinstance(TRUTH, jm.PrescribedLength)
+        else TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
+    )
     design = jm.Design("moved", moved, segments=0, lengthening=lengthening)
     found = design_information(problem, theta, design)
     f = lengthening.frequency
-    up, down = (stiffness(VALUES | {"m_w": VALUES["m_w"] * np.exp(side * STEP)}, f) for side in (1, -1))
-    active, passive = (up - down)[:, None] / (2 * STEP), VALUES["m_z"] * (2j * np.pi * f)[:, None] ** 2
+    up, down = (
+        stiffness(VALUES | {"m_w": VALUES["m_w"] * np.exp(side * STEP)}, f) for side in (1, -1)
+    )
+    active, passive = (
+        (up - down)[:, None] / (2 * STEP),
+        VALUES["m_z"] * (2j * np.pi * f)[:, None] ** 2,
+    )
     rows = np.concatenate([slopes(f), active, passive], axis=1)
     rows *= (np.sqrt(2 * lengthening.power) / 2)[:, None]
     variance = density(VALUES, f) / (4 * SECONDS)
@@ -120,18 +151,23 @@ def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
     found = found[np.ix_(own, own)] + np.diag(problem.prior[own] * [0, 0, 0, 0, 1, 1])
     found = np.linalg.inv(np.linalg.inv(found)[:4, :4])
     size = np.sqrt(np.diag(whole))[:4]
-    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-5)
+    np.testing.assert_allclose(
+        found / np.outer(size, size), expected / np.outer(size, size), atol=1e-5
+    )
     assert expected[1, 1] < 0.9 * whole[1, 1]  # known masses would tell more of K_z0
     assert "m_w and m_z fitted in this measurement" in design.told(told)[1]
 
 
 @pytest.mark.slow
 def test_two_moved_records_know_of_the_masses_once():
-    """A record twice is one of twice the mean square: the prior of the masses counts once in both."""
+    """A record twice is one of twice the mean square: the prior of the masses counts once in
+    both."""
     once = Lengthening.flat(1e-3, BAND, SECONDS)
     twice = Lengthening(once.frequency, 2 * once.power, SECONDS)
-    moved = {name: jm.Design(name, TRUTH, segments=0, lengthening=given)
-             for name, given in (("a", once), ("b", once), ("both", twice))}  # fmt: skip
+    moved = {
+        name: jm.Design(name, TRUTH, segments=0, lengthening=given)
+        for name, given in (("a", once), ("b", once), ("both", twice))
+    }
     report = jm.identifiability(hold(), designs=moved.values())
     pair = next(pair for pair in report.pairs if pair.name == "a" + TOGETHER + "b")
     single = report.designs[-1]
@@ -142,8 +178,10 @@ def test_two_moved_records_know_of_the_masses_once():
 
 @pytest.mark.slow
 def test_what_follows_from_the_spectrum_depends_on_the_masses_too(x64):
-    """Slopes of the coefficient of variation and the highest bins by differences; a record of the motion measures both."""
-    task = jm.Isometric(settings=jm.SpectrumSettings(filter_direction="both")).replace(**VALUES)  # as bundled targets
+    """Slopes of the coefficient of variation and the highest bins by differences; a record of the
+    motion measures both."""
+    # as bundled targets
+    task = jm.Isometric(settings=jm.SpectrumSettings(filter_direction="both")).replace(**VALUES)
     made = Experiment.of(fitted(task), ("K_w0",), Lengthening.flat(1e-3, (0.5, 5.0), SECONDS), None)
     names = made.here.coordinates.names
     for name, read in {
@@ -153,13 +191,16 @@ def test_what_follows_from_the_spectrum_depends_on_the_masses_too(x64):
         expected = by_differences(task, read, free=("m_w", "m_z"))
         sd = [jm.model.PARAMETERS[n].prior_sd for n in ("m_w", "m_z")]
         found = made.here.gradients[name][[names.index("m_w"), names.index("m_z")]]
-        np.testing.assert_allclose(found, expected * sd, rtol=1e-3, atol=1e-5 * np.linalg.norm(made.here.gradients[name]))
+        np.testing.assert_allclose(
+            found, expected * sd, rtol=1e-3, atol=1e-5 * np.linalg.norm(made.here.gradients[name])
+        )
         assert abs(found[0]) > 0
 
 
 @pytest.mark.slow
 def test_a_motion_for_the_stiffness_as_stretched_in_the_hold(x64):
-    """It can be asked for although the fit of a hold does not state it; value and slopes by hand."""
+    """It can be asked for although the fit of a hold does not state it; value and slopes by
+    hand."""
     made = Experiment.of(hold(), ("K_w_tangent",), Lengthening.flat(1e-3, BAND, SECONDS), None)
 
     def tangent(p):
@@ -170,7 +211,9 @@ def test_a_motion_for_the_stiffness_as_stretched_in_the_hold(x64):
     for i, name in enumerate(BASE):
         up, down = (tangent(changed(side * STEP * np.eye(4)[i])) for side in (1, -1))
         expected = (up - down) / (2 * STEP) * sd[name].prior_sd
-        assert made.here.gradients["K_w_tangent"][names.index(name)] == pytest.approx(expected, rel=1e-4, abs=1e-3)
+        assert made.here.gradients["K_w_tangent"][names.index(name)] == pytest.approx(
+            expected, rel=1e-4, abs=1e-3
+        )
     rest = made.here.values["tangent_stiffness"][0]
     assert rest == pytest.approx(stiffness(VALUES, np.array([1e-6]))[0].real, rel=1e-6)
     errors = made.errors(Lengthening.flat(1e-3, BAND, SECONDS).power)
@@ -179,14 +222,22 @@ def test_a_motion_for_the_stiffness_as_stretched_in_the_hold(x64):
 
 
 def test_a_mass_that_a_moved_record_was_fitted_with_is_known(x64):
-    """The hold of a joint fit: m_w stays as it was fixed in both. The hold has m_z fixed for itself, so that is open."""
+    """The hold of a joint fit: m_w stays as it was fixed in both. The hold has m_z fixed for
+    itself, so that is open."""
     moved = Lengthening.flat(1e-3, BAND, SECONDS)
-    measured = FrequencyResponse(moved.frequency, stiffness(VALUES, moved.frequency), np.full(len(moved.frequency), 10.0))
+    measured = FrequencyResponse(
+        moved.frequency, stiffness(VALUES, moved.frequency), np.full(len(moved.frequency), 10.0)
+    )
     problem, _ = fitted_problem(hold(), None)
     other, _ = fitted_problem(fitted(stiffness=measured, free=("k_w", "m_z")), None)
-    both = FitProblem.shared({"hold": problem, "pull": other}, {"hold": {n: n for n in problem.coordinates.names},
-                                                                "pull": {"k_w": "k_w", "m_z": "m_z"}})  # fmt: skip
-    assert opened(both).coordinates.names == (*both.coordinates.names, "m_z@hold") and opened(other) is other
+    both = FitProblem.shared(
+        {"hold": problem, "pull": other},
+        {"hold": {n: n for n in problem.coordinates.names}, "pull": {"k_w": "k_w", "m_z": "m_z"}},
+    )
+    assert (
+        opened(both).coordinates.names == (*both.coordinates.names, "m_z@hold")
+        and opened(other) is other
+    )
     assert opened(problem).coordinates.names == (*problem.coordinates.names, "m_w", "m_z")
     design = jm.Design("pulled", TRUTH, segments=0, lengthening=moved, target="hold")
     assert "(m_z fitted in this measurement)" in design.told(both)[1]
@@ -194,8 +245,13 @@ def test_a_mass_that_a_moved_record_was_fitted_with_is_known(x64):
 
 @pytest.mark.slow
 def test_what_a_record_tells_if_the_muscle_is_another_one():
-    """The prior of a task is independent of all else: a standard error up multiplies k_w by exp of its prior's, no more."""
-    task = TRUTH if isinstance(TRUTH, jm.PrescribedLength) else TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
+    """The prior of a task is independent of all else: a standard error up multiplies k_w by exp of
+    its prior's, no more."""
+    task = (
+        TRUTH
+        if isinstance(TRUTH, jm.PrescribedLength)
+        else TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
+    )
     given = {"seconds": SECONDS, "band": BAND, "rate": 50.0}
     made = jm.design_input(task, "K_w0", **given)
     factor = np.exp(made.now["K_w0"] / made.values["K_w0"])
@@ -207,12 +263,15 @@ def test_what_a_record_tells_if_the_muscle_is_another_one():
         with jax.enable_x64(True):
             known = Experiment.of(other, ("K_w0",), made.even, None).errors(made.lengthening.power)
         assert error == pytest.approx(known["K_w0"], rel=1e-6)
-    assert f"K_w0 may well be {low:.3g} N/m or {high:.3g} N/m instead of" in " ".join(str(made).split())
+    assert f"K_w0 may well be {low:.3g} N/m or {high:.3g} N/m instead of" in " ".join(
+        str(made).split()
+    )
     assert made.to_dict()["elsewhere"]["K_w0"][0] == {"value": low, "stderr": below}
 
 
 def estimates(displacement, rate, lines, seed):
-    """ln of k_w, k_z, c_w, c_z by least squares of whitened ordinates, in repeats: white noise, coloured."""
+    """ln of k_w, k_z, c_w, c_z by least squares of whitened ordinates, in repeats: white noise,
+    coloured."""
     rng, n = np.random.default_rng(seed), len(displacement)
     places = np.rint(lines * SECONDS).astype(int)
     root, moved = np.sqrt(density(VALUES, lines)), (np.fft.rfft(displacement) / n)[places]
@@ -237,7 +296,8 @@ def hold():
 
 @functools.cache
 def designed(**given):
-    """Without what it would tell of another muscle, which takes half of the time and has a test of its own."""
+    """Without what it would tell of another muscle, which takes half of the time and has a test of
+    its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_input_design, "_elsewhere", lambda *_: (np.nan, np.nan))
         return jm.design_input(hold(), **({"seconds": SECONDS, "band": BAND, "rate": 50.0} | given))
@@ -254,14 +314,22 @@ def test_repeats_scatter_as_said_and_the_designed_motion_beats_the_flat_one():
     flat = np.fft.irfft(flat)
     flat *= made.rms / np.sqrt(np.mean(flat**2))
     spread = {}
-    for name, motion, lengthening in (("flat", flat, made.even), ("designed", made.displacement, made.lengthening)):
-        np.testing.assert_allclose(lengthening.of_motion(motion).power, lengthening.power, rtol=1e-9)
+    for name, motion, lengthening in (
+        ("flat", flat, made.even),
+        ("designed", made.displacement, made.lengthening),
+    ):
+        np.testing.assert_allclose(
+            lengthening.of_motion(motion).power, lengthening.power, rtol=1e-9
+        )
         found = estimates(motion, made.rate, made.frequency, 7)
         expected = np.linalg.inv(information(lengthening))
         spread[name] = np.var(found[:, 0], ddof=1)
-        low, high = scipy.stats.chi2.ppf([DOUBTFUL / 16, 1 - DOUBTFUL / 16], REPEATS - 1) / (REPEATS - 1)
+        low, high = scipy.stats.chi2.ppf([DOUBTFUL / 16, 1 - DOUBTFUL / 16], REPEATS - 1) / (
+            REPEATS - 1
+        )
         ratio = np.var(found, axis=0, ddof=1) / np.diag(expected)
-        # ln k_w with a standard error of 0.1 is curved: its variance is up to 0.1 larger than to first order.
+        # ln k_w with a standard error of 0.1 is curved: its variance is up to 0.1 larger than to
+        # first order.
         assert np.all((low < ratio) & (ratio < high + 0.1)), (name, ratio)
     assert spread["flat"] / spread["designed"] > 1.5
     assert made.gain > 1.5
@@ -271,7 +339,8 @@ def test_repeats_scatter_as_said_and_the_designed_motion_beats_the_flat_one():
 
 
 def criterion(made, power):
-    """Sum of relative variances with a motion of these lines, from the same start as the design's."""
+    """Sum of relative variances with a motion of these lines, from the same start as the
+    design's."""
     errors = experiment(made.quantity).errors(power)
     return sum((errors[n] / made.values[n]) ** 2 for n in made.quantity)
 
@@ -285,7 +354,8 @@ def experiment(quantity):
 @pytest.mark.slow
 @pytest.mark.parametrize("quantity", [("K_w0",), ("C_z0",), ("K_w0", "K_z0", "C_w0", "C_z0")])
 def test_the_optimum_obeys_the_equivalence_theorem(quantity):
-    """No direction towards any step of the density lowers the variance, and those that are used leave it as it is."""
+    """No direction towards any step of the density lowers the variance, and those that are used
+    leave it as it is."""
     made = designed(quantity=quantity, spread=0.0)
     power, step = experiment(quantity).best(np.array([1e-3, np.inf, np.inf]), 0.0), 1e-5
     here = criterion(made, power)
@@ -319,12 +389,17 @@ def test_what_is_reported_is_of_the_motion():
 def test_limits_are_kept():
     made = designed(quantity="K_z0", peak=1.2e-3, speed=8e-3, rate=1000.0)
     velocity = np.gradient(np.append(made.displacement, made.displacement[0]), 1e-3)
-    assert np.max(np.abs(made.displacement)) <= 1.2e-3 * (1 + 1e-9) and np.max(np.abs(velocity)) <= 8e-3 * (1 + 1e-3)
+    assert np.max(np.abs(made.displacement)) <= 1.2e-3 * (1 + 1e-9) and np.max(
+        np.abs(velocity)
+    ) <= 8e-3 * (1 + 1e-3)
     assert made.speed == pytest.approx(np.max(np.abs(velocity)), rel=1e-2)
     assert max(made.peak / 1.2e-3, made.speed / 8e-3) > 0.95  # and used
     limit = "peak" if made.peak / 1.2e-3 > made.speed / 8e-3 else "speed"
     words = " ".join(str(made).split())
-    assert made.rms < 0.9e-3 and f"limit that you gave with --{limit} ({limit}=) keeps it below 1 mm rms" in words
+    assert (
+        made.rms < 0.9e-3
+        and f"limit that you gave with --{limit} ({limit}=) keeps it below 1 mm rms" in words
+    )
     assert "keeps it below" not in str(designed(quantity="K_z0"))
     assert made.gain > 1.0 and made.even.rms < made.rms
 
@@ -338,7 +413,8 @@ def test_the_acceleration_of_a_motor_is_kept():
     acceleration = np.max(np.abs(np.diff(three, 2))) / 1e-6
     assert made.acceleration == pytest.approx(acceleration, rel=1e-2)
     assert 0.9 * most < made.acceleration <= most * (1 + 1e-9)  # kept, and used
-    # Slower instead of only smaller: better than the free motion, made smaller until it keeps the limit.
+    # Slower instead of only smaller: better than the free motion, made smaller until it keeps the
+    # limit.
     smaller = experiment(("K_z0",)).errors(free.lengthening.power * (most / free.acceleration) ** 2)
     assert free.stderr["K_z0"] < made.stderr["K_z0"] < smaller["K_z0"]
 
@@ -347,7 +423,9 @@ def test_an_even_design_is_the_flat_one():
     made = designed(spread=1.0)
     assert made.gain == pytest.approx(1.0)
     assert not made.moves and "this motion is flat itself" in str(made)
-    assert "so it is a good one to begin with" in " ".join(str(made).split()) and "too vague" not in str(made)
+    assert "so it is a good one to begin with" in " ".join(
+        str(made).split()
+    ) and "too vague" not in str(made)
 
 
 @pytest.mark.slow
@@ -356,17 +434,26 @@ def test_a_flat_motion_is_drawn_and_called_once(tmp_path):
         made = designed(spread=spread, error=0.05)
         density, _, errors = made.plot().axes
         assert set(density.get_legend_handles_labels()[1]) == names
-        assert set(errors.get_legend_handles_labels()[1]) == names | {"now, without this record", "error asked for"}
+        assert set(errors.get_legend_handles_labels()[1]) == names | {
+            "now, without this record",
+            "error asked for",
+        }
         made.save(tmp_path / "motor.csv")
         head = (tmp_path / "motor.csv").read_text(encoding="utf-8").partition("time_s")[0]
-        assert ("designed by jaxmuscle for K_w0" in head) == ("designed motion" in names) != ("flat, made by" in head)
+        assert (
+            ("designed by jaxmuscle for K_w0" in head)
+            == ("designed motion" in names)
+            != ("flat, made by" in head)
+        )
 
 
 @pytest.mark.slow
 def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
-    """A record of twice the length, designed as such, has the errors told for it; at the length needed they are as wanted.
+    """A record of twice the length, designed as such, has the errors told for it; at the length
+    needed they are as wanted.
 
-    The other design has other lines and phases, and a little more than twice the Welch segments: equal to a tenth.
+    The other design has other lines and phases, and a little more than twice the Welch segments:
+    equal to a tenth.
     """
     made = designed(durations=(SECONDS, 2 * SECONDS), error=0.04)
     assert made.by_seconds[SECONDS] == pytest.approx(made.stderr, rel=1e-9)
@@ -375,18 +462,27 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
         assert made.by_seconds[2 * SECONDS][name] == pytest.approx(twice.stderr[name], rel=0.1)
     assert made.needed is not None and made.needed[0] == 0.04
     found = designed(durations=(made.needed[1],))
-    assert found.by_seconds[made.needed[1]]["K_w0"] / found.values["K_w0"] == pytest.approx(0.04, rel=1e-6)
-    assert f"to know K_w0 to 4 % (standard error), {made.needed[1]:.3g} s of record are enough" in " ".join(
-        str(made).split()
+    assert found.by_seconds[made.needed[1]]["K_w0"] / found.values["K_w0"] == pytest.approx(
+        0.04, rel=1e-6
+    )
+    assert (
+        f"to know K_w0 to 4 % (standard error), {made.needed[1]:.3g} s of record are enough"
+        in " ".join(str(made).split())
     )
     assert "for records of other lengths" in str(made) and "of other lengths" not in str(designed())
     assert "no length of the record" in str(designed(error=1e-9))
     assert (
-        made.to_dict()["needed"]["seconds"] == made.needed[1] and designed(error=1e-9).to_dict()["needed"]["seconds"] is None
+        made.to_dict()["needed"]["seconds"] == made.needed[1]
+        and designed(error=1e-9).to_dict()["needed"]["seconds"] is None
     )
-    assert "what is known without this record is enough" in " ".join(str(designed(error=0.999)).split())
+    assert "what is known without this record is enough" in " ".join(
+        str(designed(error=0.999)).split()
+    )
     small = " ".join(str(designed(rms=1e-4, error=0.04)).split())
-    assert re.search(r"to 4 % \(standard error\), a record of \S+ hours would be needed, which nobody holds", small)
+    assert re.search(
+        r"to 4 % \(standard error\), a record of \S+ hours would be needed, which nobody holds",
+        small,
+    )
     assert "less than 1 s of this motion would tell that. Play one period" in " ".join(
         str(designed(rms=0.1, error=0.1)).split()
     )
@@ -405,7 +501,10 @@ def test_a_wider_band_is_told_of_where_it_tells_more():
     other = designed(band=(0.1, 2.0), spread=1.0)
     assert made.wider is not None and made.wider[0] == 2.0
     assert made.wider[1] == pytest.approx(other.flat, rel=1e-6)
-    told = made.flat["K_w0"] > 1.3 * other.flat["K_w0"] and made.stderr["K_w0"] > 0.05 * made.values["K_w0"]
+    told = (
+        made.flat["K_w0"] > 1.3 * other.flat["K_w0"]
+        and made.stderr["K_w0"] > 0.05 * made.values["K_w0"]
+    )
     assert ("design again with --band 0.1:2 (band=(0.1, 2))" in " ".join(str(made).split())) == told
     assert designed(band=(0.1, 20.0)).wider is None  # beyond half of the rate
     slow = designed(band=(0.1, 1.0), speed=1e-3).wider
@@ -416,7 +515,11 @@ def test_a_quantity_of_several_targets_has_its_plain_name():
     known = {"K_z0": 1.0, "K_w_tangent@held": 1.0, "K_w_tangent@moved": 1.0, "mean@held": 1.0}
     assert _named("K_w_tangent", known, [None, "moved", "held"]) == "K_w_tangent@moved"
     assert _named("K_w_tangent", known, ["held", "moved"]) == "K_w_tangent@held"
-    assert [_named(n, known, [None, "moved", "held"]) for n in ("K_z0", "mean", "K")] == ["K_z0", "mean@held", "K"]
+    assert [_named(n, known, [None, "moved", "held"]) for n in ("K_z0", "mean", "K")] == [
+        "K_z0",
+        "mean@held",
+        "K",
+    ]
 
 
 @pytest.mark.slow
@@ -455,18 +558,22 @@ def test_the_standard_designs_know_what_a_flat_motion_tells():
         assert small.quantities[name].stderr > large.quantities[name].stderr
     assert large.task == "PrescribedLength (insertion moved by a motor, force measured), P_w = 5 N"
     assert large.data.endswith(
-        "response to a lengthening of 1 mm rms, 0.5 to 5 Hz, for 60 s (m_w and m_z fitted in this measurement)"
+        "response to a lengthening of 1 mm rms, 0.5 to 5 Hz, for 60 s (m_w and m_z fitted in this"
+        " measurement)"
     )
 
 
 @pytest.mark.slow
 def test_a_measured_stiffness_with_these_errors_tells_the_same(x64):
     """The likelihood of a fit and the information of a design are one."""
-    # As many points, settings and free parameters as in tests/fits/test_perturbed_fit.py: one program.
+    # As many points, settings and free parameters as in tests/fits/test_perturbed_fit.py: one
+    # program.
     lengthening = Lengthening.flat(1e-3, (0.4, 5.0), 10.0)
     assert len(lengthening.frequency) == 47
     sd = np.sqrt(density(VALUES, lengthening.frequency) / (2 * 10.0 * lengthening.power))
-    measured = FrequencyResponse(lengthening.frequency, stiffness(VALUES, lengthening.frequency), sd)
+    measured = FrequencyResponse(
+        lengthening.frequency, stiffness(VALUES, lengthening.frequency), sd
+    )
     recorded = jm.SpectrumSettings(filter_direction="both", sampling="filtered")
     task = jm.PrescribedLength(settings=recorded).replace(**VALUES)
     free, found = (*DEFAULT_FREE, "P_w", "m_w", "m_z"), {}
@@ -476,7 +583,9 @@ def test_a_measured_stiffness_with_these_errors_tells_the_same(x64):
     added = (found[False] - found[True])[:4, :4]
     expected = information(lengthening)
     size = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(added / np.outer(size, size), expected / np.outer(size, size), atol=1e-5)
+    np.testing.assert_allclose(
+        added / np.outer(size, size), expected / np.outer(size, size), atol=1e-5
+    )
 
 
 # --- files, words, figure, mistakes
@@ -487,7 +596,10 @@ def test_the_file_for_the_motor(tmp_path):
     made.save(tmp_path / "out" / "motor.csv")
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["motor.csv"]
     lines = (tmp_path / "out" / "motor.csv").read_text().splitlines()
-    assert lines[0].startswith("# one period of a lengthening of 60 s") and lines[2] == "time_s,displacement_mm"
+    assert (
+        lines[0].startswith("# one period of a lengthening of 60 s")
+        and lines[2] == "time_s,displacement_mm"
+    )
     table = np.loadtxt(tmp_path / "out" / "motor.csv", delimiter=",", skiprows=3)
     np.testing.assert_allclose(table[:, 0], made.time, atol=1e-12)
     np.testing.assert_allclose(table[:, 1], 1e3 * made.displacement, rtol=1e-6)
@@ -498,8 +610,12 @@ def test_the_file_for_the_motor(tmp_path):
 
 def test_the_default_band_begins_where_the_page_advises():
     """In Python and in the shell."""
-    advised = re.search(r"^\| band \| ([\d.]+) to", (pages.ROOT / "docs" / "perturbed.md").read_text(), re.MULTILINE)
-    here, shell = (inspect.signature(made).parameters["band"].default for made in (jm.design_input, design))
+    advised = re.search(
+        r"^\| band \| ([\d.]+) to", (pages.ROOT / "docs" / "perturbed.md").read_text(), re.MULTILINE
+    )
+    here, shell = (
+        inspect.signature(made).parameters["band"].default for made in (jm.design_input, design)
+    )
     assert advised is not None and float(advised[1]) == here[0]
     assert shell == f"{here[0]:g}:{here[1]:g}"
 
@@ -509,20 +625,32 @@ def test_the_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made = pages.run("docs/perturbed-design.md", {"result": hold(), "jm": jm})["made"]
     plt.close("all")
-    assert made.gain == pytest.approx(designed(band=(0.5, 5.0)).gain) and (tmp_path / "motor.csv").exists()
+    assert (
+        made.gain == pytest.approx(designed(band=(0.5, 5.0)).gain)
+        and (tmp_path / "motor.csv").exists()
+    )
 
 
 def test_in_words():
     text = str(designed())
     assert max(map(len, text.splitlines())) <= 80
     said = " ".join(text.split())
-    assert f"would measure K_w0 to {100 * designed().stderr['K_w0'] / designed().values['K_w0']:.2g} %" in said
-    assert f"The squared relative error of K_w0 is then {designed().gain:.2g} times as large" in said
+    assert (
+        f"would measure K_w0 to {100 * designed().stderr['K_w0'] / designed().values['K_w0']:.2g} %"
+        in said
+    )
+    assert (
+        f"The squared relative error of K_w0 is then {designed().gain:.2g} times as large" in said
+    )
     assert "A reflex can change K_w0" in said and "no fatigue. Split a long" in said
-    assert designed().held == () and "m_w" not in said  # both masses are those with which the fit of a record begins
+    # both masses are those with which the fit of a record begins
+    assert designed().held == () and "m_w" not in said
     assert designed().to_dict()["masses"]["m_w"] == {"value": 0.5, "fitted": True}
     ((low, high, share),) = designed().moves
-    assert "1 mm rms, at most" in said and f"most of the motion: {100 * share:.0f} % at {low:.2g} to {high:.2g} Hz" in said
+    assert (
+        "1 mm rms, at most" in said
+        and f"most of the motion: {100 * share:.0f} % at {low:.2g} to {high:.2g} Hz" in said
+    )
 
 
 def test_the_figure():
@@ -563,5 +691,7 @@ def test_mistakes(given, message):
 def test_a_motor_needs_an_insertion_to_move():
     loose = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)
     design = jm.Design("moved", loose, lengthening=Lengthening.flat(1e-3, BAND))
-    with pytest.raises(ValueError, match="moved: lengthening: in PrescribedForce no motor moves the insertion"):
+    with pytest.raises(
+        ValueError, match="moved: lengthening: in PrescribedForce no motor moves the insertion"
+    ):
         jm.identifiability(fitted(segments=SEGMENTS), designs=[design])

@@ -66,7 +66,8 @@ def chains_of(apart, key=0, draws=500):
 
 @pytest.mark.slow
 def test_chains_of_a_normal_density():
-    """R-hat of the spread is above 1.01 in one of some ten runs of 500 draws, and in none of 4000."""
+    """R-hat of the spread is above 1.01 in one of some ten runs of 500 draws, and in none of
+    4000."""
     found = chains_of(0.0, draws=4000)
     draws = found.s.reshape(-1, 3)
     for i, sd in enumerate((1.0, 0.1, 10.0)):
@@ -79,7 +80,8 @@ def test_chains_of_a_normal_density():
 @pytest.mark.slow
 def test_chains_that_do_not_mix_are_found_out():
     found = chains_of(40.0, key=1)
-    assert len(set(np.sign(found.s[:, -1, 0]))) == 2  # with other keys all starts may lie on one side
+    # with other keys all starts may lie on one side
+    assert len(set(np.sign(found.s[:, -1, 0]))) == 2
     success, message = verdict(found, {"x": diagnosed(found.s[:, :, 0])}, ("x",))
     assert not success and "did not mix" in message and "longer chains" in message
 
@@ -90,7 +92,10 @@ def test_chains_go_on_where_they_ended():
         density = Gaussian(np.zeros(3), np.eye(3), 0.0)
         told = []
         short, longer = (
-            found for found, _ in sample(density, jax.random.key(0), 4, (500, 600), 400, lambda *x: told.append(x))
+            found
+            for found, _ in sample(
+                density, jax.random.key(0), 4, (500, 600), 400, lambda *x: told.append(x)
+            )
         )
     whole = chains_of(0.0)
     assert np.array_equal(short.s, whole.s) and np.array_equal(longer.s[:, :500], whole.s)
@@ -112,7 +117,9 @@ def test_divergences_are_a_failure():
 def test_modes_are_told_apart():
     rng = np.random.default_rng(1)
     frequency = np.exp(
-        np.concatenate([np.log(2.0) + 0.05 * rng.normal(size=3000), np.log(8.0) + 0.05 * rng.normal(size=1000)])
+        np.concatenate(
+            [np.log(2.0) + 0.05 * rng.normal(size=3000), np.log(8.0) + 0.05 * rng.normal(size=1000)]
+        )
     )
     first, second = modes_of(frequency)
     assert first[1] == pytest.approx(2.0, rel=0.02) and second[1] == pytest.approx(8.0, rel=0.02)
@@ -122,8 +129,11 @@ def test_modes_are_told_apart():
 
 @functools.cache
 def well_known():
-    """Sixty recordings averaged: a strong rhythm, three more parameters, the rest fixed at the truth."""
-    truth = jm.Isometric().replace(c_w=80.0, harmonic_frequency=4.0, harmonic_amplitude=0.01, noise_K_z=0.008)
+    """Sixty recordings averaged: a strong rhythm, three more parameters, the rest fixed at the
+    truth."""
+    truth = jm.Isometric().replace(
+        c_w=80.0, harmonic_frequency=4.0, harmonic_amplitude=0.01, noise_K_z=0.008
+    )
     runs = jm.ensemble(jm.settled(truth), jax.random.key(2), seeds=60, control=False)
     power = np.asarray(runs.spectrum().proportional).mean(axis=0)
     target = jm.Target("well known", power, segments=(6,) * 60)
@@ -133,7 +143,8 @@ def well_known():
 
 @functools.cache
 def drawn():
-    """A hundred draws of a chain are too few, so it goes on to five hundred; if rounded otherwise, perhaps to more."""
+    """A hundred draws of a chain are too few, so it goes on to five hundred; if rounded otherwise,
+    perhaps to more."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxmuscle.uncertainty._posterior.DRAWS", (100, 500, 900))
         return jm.posterior(well_known()[1], key=3, warmup=300)
@@ -150,14 +161,17 @@ def test_curvature_profile_and_posterior_agree_where_the_data_determine_all():
         assert told.low is not None and told.high is not None
         sd = result.parameters[name].stderr
         assert sd is not None
-        # the fit weighs bins alike, the likelihood by their correlation: its errors are smaller, never by more than a third
+        # the fit weighs bins alike, the likelihood by their correlation: its errors are smaller,
+        # never by more than a third
         assert 0.67 * sd < row["sd"] < 1.15 * sd, name
         assert told.stderr == pytest.approx(row["sd"], rel=0.15), name
         assert (told.high - told.low) / 3.92 == pytest.approx(row["sd"], rel=0.15), name
         assert abs(told.value - row["mean"]) < 0.3 * row["sd"], name
         assert abs(row["mean"] - float(truth[name])) < 3.5 * row["sd"], name
         points = told.to_dataframe()
-        np.testing.assert_array_equal(points[["value", "rise"]], np.stack([told.values, told.rise], axis=1))
+        np.testing.assert_array_equal(
+            points[["value", "rise"]], np.stack([told.values, told.rise], axis=1)
+        )
 
 
 @pytest.mark.slow
@@ -167,7 +181,12 @@ def test_posterior_as_files_and_figures(tmp_path):
     assert count in (500, 900)
     found.save(tmp_path / "p.nc")
     with xarray.open_datatree(tmp_path / "p.nc", engine="h5netcdf") as tree:
-        assert set(tree.children) == {"posterior", "posterior_predictive", "sample_stats", "observed_data"}
+        assert set(tree.children) == {
+            "posterior",
+            "posterior_predictive",
+            "sample_stats",
+            "observed_data",
+        }
         assert dict(tree["posterior"].sizes) == {"chain": 4, "draw": count, "frequency": 30}
         np.testing.assert_array_equal(tree["posterior"]["c_w"].values, found.samples["c_w"])
         assert tree["posterior"]["c_w"].attrs["units"] == "N s^3/m^3"
@@ -175,7 +194,9 @@ def test_posterior_as_files_and_figures(tmp_path):
     table = json.loads((tmp_path / "p.json").read_text())
     assert table["success"] and table["summary"]["c_w"]["r_hat"] == found.diagnostics["c_w"][0]
     draws, rows = found.to_dataframe(), found.summary().to_dataframe()
-    assert list(draws.columns) == ["chain", "draw", *found.quantities] and list(rows["quantity"]) == list(found.quantities)
+    assert list(draws.columns) == ["chain", "draw", *found.quantities] and list(
+        rows["quantity"]
+    ) == list(found.quantities)
     last = draws[(draws["chain"] == 3) & (draws["draw"] == 7)]
     assert last["c_w"].item() == found.samples["c_w"][3, 7]
     assert rows.set_index("quantity")["r_hat"]["c_w"] == found.diagnostics["c_w"][0]
@@ -183,13 +204,18 @@ def test_posterior_as_files_and_figures(tmp_path):
         figure.canvas.draw()
         plt.close(figure)
     assert "95" not in str(found) and f"4 chains of {count} draws" in str(found)
-    # replicates scatter about the model as the target does: p-values are not extreme where the model is true
+    # replicates scatter about the model as the target does: p-values are not extreme where the
+    # model is true
     assert 0.01 < found.replicates.p_value < 0.99
 
 
 def of_few_draws():
     return jm.posterior(
-        well_known()[1], key=5, draws=100, warmup=50, bounds={"c_w": (1.0, 1e4), "noise_K_z": (1e-5, np.inf)}
+        well_known()[1],
+        key=5,
+        draws=100,
+        warmup=50,
+        bounds={"c_w": (1.0, 1e4), "noise_K_z": (1e-5, np.inf)},
     )
 
 
@@ -228,9 +254,13 @@ def sloppy():
 
 @pytest.mark.parametrize(
     ("ends", "words"),
-    [((None, None), "open"), ((None, 2.0), "below 2 N (open downwards)"), ((1.0, None), "above 1 N (open upwards)"),
-     ((1.0, 2.0), "1 to 2 N")],
-)  # fmt: skip
+    [
+        ((None, None), "open"),
+        ((None, 2.0), "below 2 N (open downwards)"),
+        ((1.0, None), "above 1 N (open upwards)"),
+        ((1.0, 2.0), "1 to 2 N"),
+    ],
+)
 def test_an_interval_says_which_end_is_open(ends, words):
     assert _in_words(*ends, " N") == words
 
@@ -249,7 +279,8 @@ def test_what_the_data_leave_open_has_an_open_profile():
 
 @pytest.mark.slow
 def test_density_is_summed_over_the_frequency():
-    """Against fine quadrature of the likelihood over the frequency at a point of the other coordinates."""
+    """Against fine quadrature of the likelihood over the frequency at a point of the other
+    coordinates."""
     with jax.enable_x64(True):
         problem = reopened(sloppy())
         likelihood = Likelihood.of(problem)
@@ -264,24 +295,32 @@ def test_density_is_summed_over_the_frequency():
 
         s, offset, found = at_once(summed, point)
         column = problem.coordinates.names.index("harmonic_frequency")
-        # Smooth on the scale of a bin, of which there are 30: 2049 points err by far less than what is compared.
+        # Smooth on the scale of a bin, of which there are 30: 2049 points err by far less than what
+        # is compared.
         f = np.geomspace(band.frequency[0], band.frequency[-1], 2049)
         theta = np.tile(problem.coordinates.theta(np.asarray(s)), (len(f), 1))
         theta[:, column] = problem.coordinates.theta_of("harmonic_frequency", f)
         (part,) = likelihood.objective.parts
         height = at_once(
-            lambda theta: jax.lax.map(lambda row: likelihood.at((part.moments(row),), offset), theta, batch_size=64), theta
+            lambda theta: jax.lax.map(
+                lambda row: likelihood.at((part.moments(row),), offset), theta, batch_size=64
+            ),
+            theta,
         )
-        integrand = np.exp(np.asarray(height) - 0.5 * theta[:, column] ** 2 - float(found))  # over ln f
+        # over ln f
+        integrand = np.exp(np.asarray(height) - 0.5 * theta[:, column] ** 2 - float(found))
         assert scipy.integrate.simpson(integrand, np.log(f)) == pytest.approx(1.0, abs=0.02)
-        # The cells of the grid are of single precision: slopes are those of differences of the same in double precision.
+        # The cells of the grid are of single precision: slopes are those of differences of the same
+        # in double precision.
         whole = tuple(table._replace(level=table.level.astype(float)) for table in band.tables)
         double = dataclasses.replace(density, bands=(dataclasses.replace(band, tables=whole),))
         value, slope = at_once(jax.value_and_grad(density.log_density), point)
         step = 1e-5
         steps = step * np.eye(density.size)
         points = np.concatenate([[point], point + steps, point - steps])
-        here, *beside = np.asarray(at_once(lambda points: jax.lax.map(double.log_density, points), points))
+        here, *beside = np.asarray(
+            at_once(lambda points: jax.lax.map(double.log_density, points), points)
+        )
         assert float(value) == pytest.approx(here, abs=1e-3)
         ahead, behind = np.split(np.array(beside), 2)
         np.testing.assert_allclose(slope, (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-4)
@@ -289,10 +328,13 @@ def test_density_is_summed_over_the_frequency():
 
 @pytest.mark.slow
 def test_the_common_scale_is_counted_from_the_coefficient_of_variation():
-    """The density of the amplitudes as they are, up to a constant; the coordinate alone moves the model's variation."""
+    """The density of the amplitudes as they are, up to a constant; the coordinate alone moves the
+    model's variation."""
     with jax.enable_x64(True):
         problem = reopened(sloppy())
-        density, _, _ = density_about(problem, Likelihood.of(problem), problem.theta_of((sloppy().task,)))
+        density, _, _ = density_about(
+            problem, Likelihood.of(problem), problem.theta_of((sloppy().task,))
+        )
         (level,) = density.levels
         plain = dataclasses.replace(density, levels=())
         columns = list(density.columns)
@@ -314,21 +356,32 @@ def test_the_common_scale_is_counted_from_the_coefficient_of_variation():
         places = np.tile(np.asarray(density.point), (2, 1))
         places[1, level.column] += 0.1
         here, moved = np.asarray(at_once(lambda places: jax.lax.map(variation, places), places))
-        assert moved - here == pytest.approx(0.1 * level.sd, rel=1e-3)  # noise on damping is fixed, but tiny
+        # noise on damping is fixed, but tiny
+        assert moved - here == pytest.approx(0.1 * level.sd, rel=1e-3)
 
-        # The square of that variation: of the noise, and half that of the amplitude the harmonic has in the output.
+        # The square of that variation: of the noise, and half that of the amplitude the harmonic
+        # has in the output.
         strong = places[0].copy()
         strong[problem.coordinates.names.index("harmonic_amplitude")] += 3.0
 
         def parts(s):
             task = density.task(s, 0)
             system = linearise(task)
-            told = tuple(harmonic_system(task, system)), noise_variance(task, system), system.rest, task.harmonic.amplitude
+            told = (
+                tuple(harmonic_system(task, system)),
+                noise_variance(task, system),
+                system.rest,
+                task.harmonic.amplitude,
+            )
             return *told, density.log_variation(s, 0, level.weight)[0]
 
-        (A, b, c, d, e), noise, rest, amplitude, log = jax.tree.map(np.asarray, at_once(parts, strong))
+        (A, b, c, d, e), noise, rest, amplitude, log = jax.tree.map(
+            np.asarray, at_once(parts, strong)
+        )
         s = 2j * np.pi * density.bands[0].frequency
-        swing = amplitude * np.abs([c @ np.linalg.solve(one * np.eye(len(A)) - A, b) + d + one * e for one in s])
+        swing = amplitude * np.abs(
+            [c @ np.linalg.solve(one * np.eye(len(A)) - A, b) + d + one * e for one in s]
+        )
         line = 0.5 * float(level.weight @ swing**2)
         assert line > 0.2 * noise
         np.testing.assert_allclose(np.exp(2 * log), (noise + line) / rest**2, rtol=1e-9)
@@ -368,8 +421,9 @@ def test_command(tmp_path):
     result = well_known()[1]
     result.save(tmp_path / "fit.json")
     few = ["--draws", "100", "--warmup", "50"]
-    run = CliRunner().invoke(app, ["posterior", str(tmp_path / "fit.json"), *few,
-                                   "--out", str(tmp_path / "b")])  # fmt: skip
+    run = CliRunner().invoke(
+        app, ["posterior", str(tmp_path / "fit.json"), *few, "--out", str(tmp_path / "b")]
+    )
     assert run.exit_code == 1 and "did not mix" in run.output
     assert {p.name for p in (tmp_path / "b").iterdir()} == {
         "fit.json",
@@ -379,8 +433,18 @@ def test_command(tmp_path):
         "report.html",
     }
     assert json.loads((tmp_path / "b" / "posterior.json").read_text())["summary"] is None
-    again = CliRunner().invoke(app, ["posterior", str(tmp_path / "b" / "fit.json"), *few, "--force", "--json",
-                                     "--out", str(tmp_path / "b")])  # fmt: skip
+    again = CliRunner().invoke(
+        app,
+        [
+            "posterior",
+            str(tmp_path / "b" / "fit.json"),
+            *few,
+            "--force",
+            "--json",
+            "--out",
+            str(tmp_path / "b"),
+        ],
+    )
     assert again.exit_code == 1 and "did not mix" in again.stderr
     assert json.loads(again.stdout) == json.loads((tmp_path / "b" / "posterior.json").read_text())
 
@@ -400,8 +464,12 @@ def test_the_calibration_draws_its_muscles_from_the_prior_of_the_fit():
     study = benchmark()
     base, truths = study.base(), [study.truth(number) for number in range(300)]
     for name in ("k_w", "c_z", "noise_K_z", "harmonic_amplitude"):
-        theta = [np.log(float(task[name]) / float(base[name])) / PARAMETERS[name].prior_sd for task in truths]
-        assert scipy.stats.kstest(theta, "norm").pvalue > 1e-4, name  # chance that one of four fails: 4 in 10 000 seeds
+        theta = [
+            np.log(float(task[name]) / float(base[name])) / PARAMETERS[name].prior_sd
+            for task in truths
+        ]
+        # chance that one of four fails: 4 in 10 000 seeds
+        assert scipy.stats.kstest(theta, "norm").pvalue > 1e-4, name
     frequency = np.array([float(task["harmonic_frequency"]) for task in truths])
     row = PARAMETERS["harmonic_frequency"]
     assert row.fit_lower < frequency.min() and frequency.max() < row.fit_upper

@@ -1,4 +1,5 @@
-"""Profile, posterior, identifiability, goodness and bootstrap of fits of several targets, against those of one."""
+"""Profile, posterior, identifiability, goodness and bootstrap of fits of several targets, against
+those of one."""
 
 import dataclasses
 import functools
@@ -19,7 +20,9 @@ from jaxmuscle.objective._likelihood import Likelihood
 from jaxmuscle.uncertainty._design_information import information_of, seen_here
 from jaxmuscle.uncertainty._posterior_density import density_about
 
-TRUTH = jm.Isometric().replace(c_w=80.0, noise_K_w=0.2, harmonic_amplitude=0.012, harmonic_frequency=5.0)
+TRUTH = jm.Isometric().replace(
+    c_w=80.0, noise_K_w=0.2, harmonic_amplitude=0.012, harmonic_frequency=5.0
+)
 TASKS = {"low": TRUTH.replace(P_w=4.0), "high": TRUTH.replace(P_w=8.0)}
 FREE = ("c_w", "noise_K_w", "harmonic_amplitude")
 QUICK = {"starts": 2, "seeds": 0}
@@ -29,9 +32,17 @@ QUICK = {"starts": 2, "seeds": 0}
 def targets():
     """Expected spectra with scatter of the size that their segments have."""
     rng = np.random.default_rng(4)
-    powers = {name: np.asarray(jm.expected_spectrum(task).proportional) * np.exp(0.2 * rng.standard_normal(30))
-              for name, task in TASKS.items()}  # fmt: skip
-    return {name: jm.Target(name, power, segments=24, coefficient_of_variation=0.02) for name, power in powers.items()}
+    powers = {
+        name: (
+            np.asarray(jm.expected_spectrum(task).proportional)
+            * np.exp(0.2 * rng.standard_normal(30))
+        )
+        for name, task in TASKS.items()
+    }
+    return {
+        name: jm.Target(name, power, segments=24, coefficient_of_variation=0.02)
+        for name, power in powers.items()
+    }
 
 
 @functools.cache
@@ -48,14 +59,24 @@ def alone(name, free=FREE):
 @pytest.mark.slow
 def test_a_joint_fit_of_one_target_is_the_fit_of_that():
     joint = jm.fit_joint({"low": targets()["low"]}, tasks={"low": TASKS["low"]}, free=FREE, **QUICK)
-    for name in ("parameters", "derived", "correlation", "undetermined", "starts", "settings", "notices"):
+    for name in (
+        "parameters",
+        "derived",
+        "correlation",
+        "undetermined",
+        "starts",
+        "settings",
+        "notices",
+    ):
         assert getattr(joint, name) == getattr(alone("low"), name), name
     np.testing.assert_array_equal(joint.fitted, alone("low").fitted)
     assert jm.profile(joint, "c_w").intervals == jm.profile(alone("low"), "c_w").intervals
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("separate", [(), ("c_w", "harmonic_amplitude")], ids=["shared", "separate"])
+@pytest.mark.parametrize(
+    "separate", [(), ("c_w", "harmonic_amplitude")], ids=["shared", "separate"]
+)
 def test_a_fit_taken_up_again_is_at_the_same_point(x64, separate):
     joint = both(separate=separate)
     problem = reopened(joint)
@@ -69,13 +90,27 @@ def test_a_fit_taken_up_again_is_at_the_same_point(x64, separate):
 
 @pytest.mark.slow
 def test_proportional_parameters_are_taken_up_with_their_ratio(x64):
-    names = ("k_w", "k_z", "c_w", "c_z", "noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
+    names = (
+        "k_w",
+        "k_z",
+        "c_w",
+        "c_z",
+        "noise_K_w",
+        "noise_K_z",
+        "noise_C_w",
+        "noise_C_z",
+        "harmonic_amplitude",
+    )
     tasks = {"low": jm.at_level(TRUTH, 0.15), "high": jm.at_level(TRUTH, 0.6)}
     with without_intervals():
-        joint = jm.fit_joint(targets(), tasks=tasks, free=("k_w", "c_w"), proportional=names, **QUICK)
+        joint = jm.fit_joint(
+            targets(), tasks=tasks, free=("k_w", "c_w"), proportional=names, **QUICK
+        )
     problem = reopened(joint)
     for part, task in zip(problem.parts, tasks.values(), strict=True):
-        np.testing.assert_allclose(part.coordinates.centre, [float(task[n]) for n in ("k_w", "c_w")], rtol=1e-12)
+        np.testing.assert_allclose(
+            part.coordinates.centre, [float(task[n]) for n in ("k_w", "c_w")], rtol=1e-12
+        )
 
 
 @pytest.mark.slow
@@ -83,10 +118,14 @@ def test_the_likelihoods_of_the_targets_add_up(x64):
     joint = both()
     problem = reopened(joint)
     likelihood = Likelihood.of(problem)
-    moments = expand(problem.linear(), problem.theta_of(tuple(joint.tasks.values()))[None]).row(0).moments
+    moments = (
+        expand(problem.linear(), problem.theta_of(tuple(joint.tasks.values()))[None]).row(0).moments
+    )
     each = [jm.log_likelihood(part.task, part.target) for part in joint.parts.values()]
     # `log_likelihood` also has the normalisation of the coefficient of variation's law.
-    each = [float(x) + np.log(part.variation[1]) for x, part in zip(each, problem.parts, strict=True)]
+    each = [
+        float(x) + np.log(part.variation[1]) for x, part in zip(each, problem.parts, strict=True)
+    ]
     assert float(likelihood.marginal(moments)) == pytest.approx(sum(each), rel=1e-9)
 
 
@@ -99,15 +138,24 @@ def test_information_adds_up(x64):
     whole = information_of(problem, seen_here(problem, problem.theta_of(tasks)))
     parts = []
     for i, name in enumerate(TASKS):
-        single = dataclasses.replace(reopened(alone(name)), parts=(problem.parts[i],), coordinates=problem.coordinates)
+        single = dataclasses.replace(
+            reopened(alone(name)), parts=(problem.parts[i],), coordinates=problem.coordinates
+        )
         parts.append(information_of(single, seen_here(single, problem.theta_of(tasks))))
     np.testing.assert_allclose(whole, sum(parts), rtol=1e-9, atol=1e-9 * np.abs(whole).max())
     found = jm.identifiability(joint)
-    np.testing.assert_allclose(found.present.singular_values**2, np.linalg.eigvalsh(whole)[::-1], rtol=1e-8)
-    assert {"high_frequency_floor@low", "high_frequency_floor@high", "C_w0"} <= set(found.present.quantities)
+    np.testing.assert_allclose(
+        found.present.singular_values**2, np.linalg.eigvalsh(whole)[::-1], rtol=1e-8
+    )
+    assert {"high_frequency_floor@low", "high_frequency_floor@high", "C_w0"} <= set(
+        found.present.quantities
+    )
     # A force level beyond each end, and of each target a longer recording.
     levels = [design.name for design in found.designs if "force level" in design.name]
-    assert levels == ["a second force level 0.5 times as high (low)", "a second force level 2 times as high (high)"]
+    assert levels == [
+        "a second force level 0.5 times as high (low)",
+        "a second force level 2 times as high (high)",
+    ]
     assert sum("10 times as long" in design.name for design in found.designs) == 2
     held = "Isometric (insertion held, force measured)"
     assert f"low: {held}, P_w = 4 N; high: {held}, P_w = 8 N" in found.present.task
@@ -125,7 +173,10 @@ def test_a_design_names_the_target_that_it_is_like():
 def test_two_targets_narrow_the_profile():
     found, single = jm.profile(both(), "c_w"), [jm.profile(alone(name), "c_w") for name in TASKS]
     assert found.stderr**-2 == pytest.approx(sum(p.stderr**-2 for p in single), rel=0.2)
-    low, high = jm.profile(both(), "corner_frequency@low"), jm.profile(both(), "corner_frequency@high")
+    low, high = (
+        jm.profile(both(), "corner_frequency@low"),
+        jm.profile(both(), "corner_frequency@high"),
+    )
     assert low.value < high.value and low.unit == high.unit == "Hz"  # stiffer under force
     assert low.low is not None and high.high is not None
     with pytest.raises(ValueError, match="'corner_frequency' is neither free nor derived"):
@@ -138,8 +189,13 @@ def test_densities_of_separate_parameters_add_up(x64):
     free = ("c_w", "noise_K_w", "harmonic_amplitude", "harmonic_frequency")
     joint = both(free, free)
     problem = reopened(joint)
-    whole, _, _ = density_about(problem, Likelihood.of(problem), problem.theta_of(tuple(joint.tasks.values())))
-    assert [band.name for band in whole.bands] == ["harmonic_frequency@low", "harmonic_frequency@high"]
+    whole, _, _ = density_about(
+        problem, Likelihood.of(problem), problem.theta_of(tuple(joint.tasks.values()))
+    )
+    assert [band.name for band in whole.bands] == [
+        "harmonic_frequency@low",
+        "harmonic_frequency@high",
+    ]
     assert len(whole.levels) == 2 and whole.size == 6 + 2
     single = []
     for name in TASKS:
@@ -153,7 +209,10 @@ def test_densities_of_separate_parameters_add_up(x64):
     # Coordinates of the joint density: three of each target, then the offsets.
     own = [[0, 1, 2, 6], [3, 4, 5, 7]]
     found = rises(whole, whole.centre, steps)
-    wanted = [rises(density, whole.centre[part], steps[:, part]) for density, part in zip(single, own, strict=True)]
+    wanted = [
+        rises(density, whole.centre[part], steps[:, part])
+        for density, part in zip(single, own, strict=True)
+    ]
     np.testing.assert_allclose(found, sum(wanted), rtol=0.02, atol=0.02)
 
 
@@ -161,8 +220,14 @@ def rises(density, centre, steps):
     """By how much the log density differs from that at a centre."""
     points = np.concatenate([[centre], centre + steps])
     white = np.linalg.solve(np.asarray(density.scale), (points - density.centre).T).T
-    arrays, fixed = eqx.partition(density, lambda x: isinstance(x, jax.Array | np.ndarray | np.generic))
-    log_density = at_once(lambda arrays, white: jax.lax.map(eqx.combine(arrays, fixed).log_density, white), arrays, white)
+    arrays, fixed = eqx.partition(
+        density, lambda x: isinstance(x, jax.Array | np.ndarray | np.generic)
+    )
+    log_density = at_once(
+        lambda arrays, white: jax.lax.map(eqx.combine(arrays, fixed).log_density, white),
+        arrays,
+        white,
+    )
     return np.asarray(log_density)[1:] - np.asarray(log_density)[0]
 
 
@@ -175,11 +240,16 @@ def test_the_posterior_of_two_targets(tmp_path, monkeypatch):
     assert set(found.parts) == {"low", "high"} and set(found.samples) == set(FREE)
     summary = found.summary()
     for name in ("c_w", "noise_K_w"):
-        assert abs(summary[name]["median"] - joint.parameters[name].value) < joint.parameters[name].stderr
+        assert (
+            abs(summary[name]["median"] - joint.parameters[name].value)
+            < joint.parameters[name].stderr
+        )
         assert summary[name]["sd"] == pytest.approx(joint.parameters[name].stderr, rel=0.35)
     for name in TASKS:
         task = found.task_of(1, 7, name)
-        assert float(task["c_w"]) == found.samples["c_w"][1, 7] and float(task["P_w"]) == float(TASKS[name]["P_w"])
+        assert float(task["c_w"]) == found.samples["c_w"][1, 7] and float(task["P_w"]) == float(
+            TASKS[name]["P_w"]
+        )
         assert 0.01 < found.parts[name].replicates.p_value < 0.99
         plt.close(found.plot_predictive(target=name).figure)
     with pytest.raises(AttributeError, match=r"posterior\.parts\['low'\]"):
@@ -199,13 +269,18 @@ def test_goodness_of_two_targets():
     """The worse of two spectra is named; that of a joint fit of one target is that of the fit."""
     odd = targets()["high"].proportional_power.copy()
     odd[15] *= 8.0
-    pair = {"low": targets()["low"], "high": jm.Target("high", odd, segments=24, coefficient_of_variation=0.02)}
+    pair = {
+        "low": targets()["low"],
+        "high": jm.Target("high", odd, segments=24, coefficient_of_variation=0.02),
+    }
     with without_intervals():
         result = jm.fit_joint(pair, tasks=TASKS, free=FREE, **QUICK)
     found = jm.goodness(result, replicates=99)
     assert found.parts["high"].p_values["largest"] <= 0.02 < found.parts["low"].p_values["largest"]
     assert found.p_value <= 0.05
-    assert "high: compared with 99 spectra" in str(found) and "all targets together: p = " in str(found)
+    assert "high: compared with 99 spectra" in str(found) and "all targets together: p = " in str(
+        found
+    )
     assert len(found.plot().axes) == 8
     plt.close("all")
 
@@ -215,7 +290,9 @@ def test_bootstrap_of_two_targets(monkeypatch):
     monkeypatch.setattr(_bootstrap, "STARTS", 8)
     with without_intervals():
         found = jm.bootstrap(both(), replicates=12, key=2)
-    assert {"c_w", "noise_K_w", "corner_frequency@low", "corner_frequency@high"} <= set(found.quantities)
+    assert {"c_w", "noise_K_w", "corner_frequency@low", "corner_frequency@high"} <= set(
+        found.quantities
+    )
     assert found.target == "low, high" and set(found.tasks) == set(TASKS)
     # The spread over the stated error of 12 refits scatters by 0.21.
     for name in ("c_w", "corner_frequency@high"):

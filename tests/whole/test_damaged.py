@@ -1,4 +1,5 @@
-"""Files that were damaged or changed by hand: read as they say, or refused with one sentence that names the file."""
+"""Files that were damaged or changed by hand: read as they say, or refused with one sentence that
+names the file."""
 
 import collections
 
@@ -7,8 +8,18 @@ import pytest
 from test_result import made_result
 
 COUNT = 250  # of every format; `python tests/damage.py --count 5000` tries more
-FREE = {"components", "check", "further", "derived", "bounds", "versions"}  # tables whose keys are free
-NAMES = ("fit.json", "preset.toml", "target.toml", "project.json", "target.csv", "study.csv", "study.toml", "recording.csv")
+# tables whose keys are free
+FREE = {"components", "check", "further", "derived", "bounds", "versions"}
+NAMES = (
+    "fit.json",
+    "preset.toml",
+    "target.toml",
+    "project.json",
+    "target.csv",
+    "study.csv",
+    "study.toml",
+    "recording.csv",
+)
 
 
 @pytest.fixture(scope="module")
@@ -31,14 +42,17 @@ def test_mutants_are_read_as_they_say_or_refused(name, valid):
     formats, folder = valid
     counts, wrong = damage.tried(formats[name], COUNT, folder)
     told = collections.Counter(found for found, _ in wrong)
-    assert not wrong, f"{len(wrong)} of {COUNT}: {told.most_common(5)}; the first: {wrong[0][1][:300]!r}"
+    assert not wrong, (
+        f"{len(wrong)} of {COUNT}: {told.most_common(5)}; the first: {wrong[0][1][:300]!r}"
+    )
     assert min(counts["read"], counts["refused"]) > COUNT / 50  # neither refuses all nor takes all
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["fit.json", "preset.toml"])
 def test_a_key_that_is_not_there_gets_no_default(name, valid):
-    """Without any key that a file of its kind has, it is refused: but for what is no number of a preset's task."""
+    """Without any key that a file of its kind has, it is refused: but for what is no number of a
+    preset's task."""
     formats, folder = valid
     of, kind = formats[name], name.rpartition(".")[2]
     table = damage.parsed_as(of.text, kind)

@@ -1,4 +1,5 @@
-"""The documentation against the package: every public name described once, links that lead somewhere, a current table."""
+"""The documentation against the package: every public name described once, links that lead
+somewhere, a current table."""
 
 import ast
 import contextlib
@@ -39,12 +40,17 @@ TOP = imports(PACKAGE / "__init__.pyi")
 WINGS = {name for name, module in TOP.items() if module is None} | {"errors"}
 # Where a user finds a name: "fit", or "model.Decay" for what is not at the top.
 PUBLIC = [name for name in TOP if name not in WINGS] + [
-    f"{wing}.{name}" for wing in sorted(WINGS - {"plot"}) for name in vars_of(wing) if name not in TOP
+    f"{wing}.{name}"
+    for wing in sorted(WINGS - {"plot"})
+    for name in vars_of(wing)
+    if name not in TOP
 ]
 
 
 def test_reference_describes_every_public_name_once():
-    pages = "\n".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
+    pages = "\n".join(
+        page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md")
+    )
     described = Counter(re.findall(r"^::: jaxmuscle\.([\w.]+)$", pages, re.MULTILINE))
     functions = [f"plot.{name}" for name in jm.plot.__all__ if callable(getattr(jm.plot, name))]
     assert described == Counter([*PUBLIC, "plot", *functions])
@@ -56,7 +62,9 @@ def test_the_top_has_the_names_of_everyday_work():
 
 # Values and the module of figures stand on their pages of the reference.
 NAMES = sorted(set(PUBLIC) - {"__version__", "PARAMETERS", "model.TASKS"})
-FIGURES = [name for name in jm.plot.__all__ if callable(getattr(jm.plot, name)) and name != "styled"]
+FIGURES = [
+    name for name in jm.plot.__all__ if callable(getattr(jm.plot, name)) and name != "styled"
+]
 # Of results, which the types of these fields explain.
 EVERYWHERE = {"ax", "seed", "settings", "target", "task", "versions"}
 
@@ -64,7 +72,9 @@ EVERYWHERE = {"ax", "seed", "settings", "target", "task", "versions"}
 def described(thing):
     """The words of a docstring, of a class also those of its public bases."""
     family = (
-        [c for c in inspect.getmro(thing) if c.__module__.startswith("jaxmuscle")] if inspect.isclass(thing) else [thing]
+        [c for c in inspect.getmro(thing) if c.__module__.startswith("jaxmuscle")]
+        if inspect.isclass(thing)
+        else [thing]
     )
     return set(re.findall(r"\w+", " ".join(inspect.getdoc(one) or "" for one in family)))
 
@@ -83,22 +93,44 @@ def test_public_object_is_documented(name):
     else:
         given = set(getattr(thing, "_fields", ()))
     words = described(thing)
-    missing = {one for one in given - EVERYWHERE if one not in words and re.sub("_[wz]", "_j", one, count=1) not in words}
+    missing = {
+        one
+        for one in given - EVERYWHERE
+        if one not in words and re.sub("_[wz]", "_j", one, count=1) not in words
+    }
     assert not missing
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if inspect.isclass(operator.attrgetter(name)(jm))])
+@pytest.mark.parametrize(
+    "name", [name for name in NAMES if inspect.isclass(operator.attrgetter(name)(jm))]
+)
 def test_public_methods_are_documented(name):
     thing = operator.attrgetter(name)(jm)
     kinds = (types.FunctionType, property, classmethod, staticmethod)
-    public = [attribute for attribute, value in vars(thing).items() if attribute[0] != "_" and isinstance(value, kinds)]
+    public = [
+        attribute
+        for attribute, value in vars(thing).items()
+        if attribute[0] != "_" and isinstance(value, kinds)
+    ]
     assert not [attribute for attribute in public if not inspect.getdoc(getattr(thing, attribute))]
 
 
 FUNCTIONS = [name for name in NAMES if inspect.isroutine(operator.attrgetter(name)(jm))]
-OF_PROCESSES = {"ensembles.join", "ensembles.launched", "ensembles.leave", "ensembles.measure"}  # docs/ensembles.md
-RUN = ("list_", "load_target", "load_preset", "on_rung", "task_for", "save_preset", "data.as_", "response.", "spectra.",
-       "at_", "scaled")  # fmt: skip
+# docs/ensembles.md
+OF_PROCESSES = {"ensembles.join", "ensembles.launched", "ensembles.leave", "ensembles.measure"}
+RUN = (
+    "list_",
+    "load_target",
+    "load_preset",
+    "on_rung",
+    "task_for",
+    "save_preset",
+    "data.as_",
+    "response.",
+    "spectra.",
+    "at_",
+    "scaled",
+)
 
 
 def examples(name):
@@ -107,7 +139,11 @@ def examples(name):
     for block in re.findall(r"(?:^    .*\n?)+", text, re.MULTILINE):
         code = textwrap.dedent(block)
         with contextlib.suppress(SyntaxError):  # a formula
-            calls = [ast.unparse(node.func) for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Call)]
+            calls = [
+                ast.unparse(node.func)
+                for node in ast.walk(ast.parse(code))
+                if isinstance(node, ast.Call)
+            ]
             if name.rpartition(".")[2] in {call.rpartition(".")[2] for call in calls}:
                 yield code
 
@@ -118,7 +154,10 @@ def test_function_has_an_example(name, tmp_path, monkeypatch):
     """Those that need neither a file of the reader's nor a fit are run."""
     code = "\n".join(examples(name))
     assert code
-    named = {f"{wing}.{one}" if one else wing for wing, one in re.findall(r"\bjm\.(\w+)(?:\.([a-z]\w*))?", code)}
+    named = {
+        f"{wing}.{one}" if one else wing
+        for wing, one in re.findall(r"\bjm\.(\w+)(?:\.([a-z]\w*))?", code)
+    }
     assert {one for one in named if one.partition(".")[0] not in TOP} == set()
     if name.startswith(RUN):
         monkeypatch.chdir(tmp_path)
@@ -134,8 +173,15 @@ def test_figures_are_documented(name):
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_relative_links_lead_to_files(page):
-    text = re.sub(r"^```.*?^```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    targets = [link.partition("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link]
+    text = re.sub(
+        r"^```.*?^```|`[^`\n]*`",
+        "",
+        page.read_text(encoding="utf-8"),
+        flags=re.MULTILINE | re.DOTALL,
+    )
+    targets = [
+        link.partition("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link
+    ]
     missing = [link for link in targets if link and not (page.parent / link).exists()]
     assert not missing
 
@@ -144,7 +190,9 @@ def test_relative_links_lead_to_files(page):
 def test_names_in_pages_are_public(page):
     text = page.read_text(encoding="utf-8")
     of_wings = {
-        f"{wing}.{name}" for wing, name in re.findall(r"\bjm\.(\w+)\.([A-Za-z]\w*)", text) if wing in WINGS - {"plot"}
+        f"{wing}.{name}"
+        for wing, name in re.findall(r"\bjm\.(\w+)\.([A-Za-z]\w*)", text)
+        if wing in WINGS - {"plot"}
     }
     mentioned = set(re.findall(r"\bjm\.(\w+)", text)) - {"NAME"} - WINGS
     assert mentioned | of_wings <= set(PUBLIC)
@@ -159,7 +207,8 @@ def test_python_in_pages_parses(page):
 def test_every_page_is_in_the_navigation():
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     pages = {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
-    notebooks = {f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")}  # made by docs/notebooks.py
+    # made by docs/notebooks.py
+    notebooks = {f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")}
     assert set(re.findall(r"[\w/-]+\.md", navigation)) == pages | notebooks
 
 
@@ -167,8 +216,12 @@ def test_every_page_is_in_the_navigation():
 def test_every_formula_of_a_page_can_be_typeset():
     """As the site does without the network, in `docs/notebooks.py`; GitHub does it by itself."""
     formulas = module(ROOT / "docs" / "formulas.py")
-    rows = [row for page in PAGES for found in formulas.BLOCK.finditer(page.read_text(encoding="utf-8"))
-            for row in formulas.lines(found[2])]  # fmt: skip
+    rows = [
+        row
+        for page in PAGES
+        for found in formulas.BLOCK.finditer(page.read_text(encoding="utf-8"))
+        for row in formulas.lines(found[2])
+    ]
     assert len(rows) > 25
     for row in rows:
         assert formulas.picture(row).startswith('<img class="math"')
@@ -185,14 +238,20 @@ def test_the_citation_names_the_current_version():
 
 def test_parameter_page_is_current():
     generate = module(ROOT / "docs" / "generate.py")
-    assert generate.PAGE.read_text(encoding="utf-8") == generate.page(), "run `python docs/generate.py`"
-    assert generate.FILES.read_text(encoding="utf-8") == generate.files_page(), "run `python docs/generate.py`"
+    assert generate.PAGE.read_text(encoding="utf-8") == generate.page(), (
+        "run `python docs/generate.py`"
+    )
+    assert generate.FILES.read_text(encoding="utf-8") == generate.files_page(), (
+        "run `python docs/generate.py`"
+    )
 
 
 @pytest.mark.slow
 def test_the_picture_of_the_layers_is_current():
     architecture = module(ROOT / "docs" / "architecture.py")
-    assert architecture.PICTURE.read_text(encoding="utf-8") == architecture.picture(), "run `python docs/architecture.py`"
+    assert architecture.PICTURE.read_text(encoding="utf-8") == architecture.picture(), (
+        "run `python docs/architecture.py`"
+    )
     assert set(architecture.HOLDS) == {wing for row in architecture.layers() for wing in row}
 
 

@@ -24,8 +24,12 @@ STATED = 0.05  # the page gives two digits
 
 def fitted(name):
     """The isometric muscle of fitting/expected."""
-    values = json.loads((pages.ROOT / "fitting" / "expected" / f"{name}.json").read_text(encoding="utf-8"))["values"]
-    return jm.Isometric().replace(**{key: row["value"] for key, row in values.items() if key in jm.PARAMETERS})
+    values = json.loads(
+        (pages.ROOT / "fitting" / "expected" / f"{name}.json").read_text(encoding="utf-8")
+    )["values"]
+    return jm.Isometric().replace(
+        **{key: row["value"] for key, row in values.items() if key in jm.PARAMETERS}
+    )
 
 
 def variation(task):
@@ -46,9 +50,13 @@ def says(*words):
 def test_the_force_read_is_less_than_the_force_of_the_muscle(x64):
     mean = kept_jit(jax.vmap(lambda v: linearise(jm.Isometric().replace(**v)).rest))
     rng, n = np.random.default_rng(0), 2000
-    drawn = {name: jm.PARAMETERS[name].default * np.exp(rng.normal(size=n)) for name in ("k_w", "k_z")}
+    drawn = {
+        name: jm.PARAMETERS[name].default * np.exp(rng.normal(size=n)) for name in ("k_w", "k_z")
+    }
     share = np.asarray(mean(drawn | {"x_z": np.zeros(n), "P_w": np.full(n, 5.0)})) / 5.0
-    assert share.max() < 1 and (share.min(), share.max()) == pytest.approx((0.005, 0.99), rel=STATED + 0.02)
+    assert share.max() < 1 and (share.min(), share.max()) == pytest.approx(
+        (0.005, 0.99), rel=STATED + 0.02
+    )
     assert float(linearise(as_arrays(jm.Isometric())).rest) / 5.0 == pytest.approx(0.44, rel=STATED)
     says("44 % of P_w is left at the defaults, 0.5 to 99 % over 2000 draws")
     drawn_out = np.asarray(mean(drawn | {"x_z": np.full(n, -0.01), "P_w": np.full(n, 5.0)})) / 5.0
@@ -61,11 +69,20 @@ def test_noise_against_the_papers(x64):
     found = [float(task["noise_K_w"]) for task in (knee, finger)]
     assert found == pytest.approx([0.27, 0.46], rel=STATED)
     assert np.array(found) / PAPER == pytest.approx([170, 290], rel=STATED)
-    assert [variation(task) for task in (knee, finger)] == pytest.approx([0.013, 0.018], rel=STATED + 0.02)
+    assert [variation(task) for task in (knee, finger)] == pytest.approx(
+        [0.013, 0.018], rel=STATED + 0.02
+    )
     alone = [variation(task.replace(**QUIET, noise_K_w=PAPER)) for task in (knee, finger)]
     assert alone == pytest.approx([8e-5, 7e-5], rel=0.1)  # one digit
-    everything = QUIET | {"noise_K_w": PAPER, "noise_K_z": PAPER, "noise_C_w": 1e-4, "noise_C_z": 1e-4}
-    assert [variation(task.replace(**everything)) for task in (knee, finger)] == pytest.approx([0.0013] * 2, rel=STATED)
+    everything = QUIET | {
+        "noise_K_w": PAPER,
+        "noise_K_z": PAPER,
+        "noise_C_w": 1e-4,
+        "noise_C_z": 1e-4,
+    }
+    assert [variation(task.replace(**everything)) for task in (knee, finger)] == pytest.approx(
+        [0.0013] * 2, rel=STATED
+    )
     says("noise of 27 %", "and 46 %", "170 and 290 times", "0.008 and 0.007 %", "0.13 %")
 
 
@@ -76,7 +93,10 @@ def test_damping_ratios(x64):
     reconstructed = [ratios[name] for name in RECONSTRUCTED]
     assert (min(reconstructed), max(reconstructed)) == pytest.approx((1.8, 6.4), rel=STATED)
     assert damping_ratio(jm.Isometric()) == pytest.approx(1.9, rel=STATED)
-    says("is 3.3 and 6.5 in those fits, 1.8 to 6.4 in those of the reconstructed spectra, 1.9 at the defaults")
+    says(
+        "is 3.3 and 6.5 in those fits, 1.8 to 6.4 in those of the reconstructed spectra, 1.9 at the"
+        " defaults"
+    )
 
 
 @pytest.mark.slow
@@ -84,13 +104,22 @@ def test_a_quick_muscle_with_slow_noise_fits_as_well(x64):
     """Of one target; the other's numbers were found in the same way."""
     target = jm.load_target(FINGER)
     quick = {"m_w": 0.05, "c_w": 5.0, "c_z": 5.0}
-    result = jm.fit(jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise()), target, fix=quick, check_seeds=0)
+    result = jm.fit(
+        jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise()), target, fix=quick, check_seeds=0
+    )
     assert result.success
     A = np.asarray(linearise(as_arrays(result.task)).A)
     assert damping_ratio(result.task) == pytest.approx(1.1, rel=STATED)
     assert 9 < np.abs(np.linalg.eigvals(A).real).min() / (2 * np.pi) < 13
-    assert 1 / (2 * np.pi * float(result.task["noise_correlation_time"])) == pytest.approx(0.33, rel=STATED)
-    expected = json.loads((pages.ROOT / "fitting" / "expected" / f"{FINGER}.json").read_text(encoding="utf-8"))
+    assert 1 / (2 * np.pi * float(result.task["noise_correlation_time"])) == pytest.approx(
+        0.33, rel=STATED
+    )
+    expected = json.loads(
+        (pages.ROOT / "fitting" / "expected" / f"{FINGER}.json").read_text(encoding="utf-8")
+    )
     assert result.chi2_per_bin == pytest.approx(0.91, rel=STATED)
     assert result.chi2_per_bin < expected["values"]["chi2_per_bin"]["value"]
-    says("corner at 0.91 and 0.33 Hz", "per bin 1.18 and 0.91, the default muscle with band-limited noise 1.18 and 0.98")
+    says(
+        "corner at 0.91 and 0.33 Hz",
+        "per bin 1.18 and 0.91, the default muscle with band-limited noise 1.18 and 0.98",
+    )

@@ -1,4 +1,5 @@
-"""Wheel and sdist as a user gets them: built, installed into an empty environment, and used there."""
+"""Wheel and sdist as a user gets them: built, installed into an empty environment, and used
+there."""
 
 import email
 import json
@@ -23,9 +24,16 @@ pytestmark = pytest.mark.slow
 
 
 def run(*command, cwd, **environment):
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_"))}
+    kept = {
+        name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_"))
+    }
     done = subprocess.run(
-        [str(c) for c in command], cwd=cwd, env=kept | environment, capture_output=True, text=True, check=False
+        [str(c) for c in command],
+        cwd=cwd,
+        env=kept | environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -46,14 +54,29 @@ def built(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def installed(built, tmp_path_factory):
-    """An environment with the wheel; what it depends on is borrowed from this one, whose editable install is not."""
+    """An environment with the wheel; what it depends on is borrowed from this one, whose editable
+    install is not."""
     folder = tmp_path_factory.mktemp("installed")
     venv.create(folder / "clean", symlinks=True)
     (wheel,) = built.glob("*.whl")
     python = folder / "clean" / "bin" / "python"
-    run(sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel, cwd=folder)
-    purelib = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder).strip()
-    # A .pth file is not read in a folder that another .pth file names: the editable install stays behind.
+    run(
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        python,
+        "install",
+        "--no-deps",
+        "--no-index",
+        wheel,
+        cwd=folder,
+    )
+    purelib = run(
+        python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder
+    ).strip()
+    # A .pth file is not read in a folder that another .pth file names: the editable install stays
+    # behind.
     borrowed = [path for path in sys.path if Path(path).name == "site-packages"]
     Path(purelib, "borrowed.pth").write_text("\n".join(borrowed), encoding="utf-8")
     return folder
@@ -64,10 +87,18 @@ def test_wheel_holds_the_package_and_its_data_and_nothing_else(built):
     (wheel,) = built.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     package = ROOT / "src" / "jaxmuscle"
-    wanted = {f"jaxmuscle/{path.relative_to(package).as_posix()}" for path in package.rglob("*") if path.is_file()}
+    wanted = {
+        f"jaxmuscle/{path.relative_to(package).as_posix()}"
+        for path in package.rglob("*")
+        if path.is_file()
+    }
     wanted = {name for name in wanted if "__pycache__" not in name}
     assert {name for name in names if ".dist-info/" not in name} == wanted
-    assert {"jaxmuscle/py.typed", f"jaxmuscle/targets/{TARGET}.toml", "jaxmuscle/presets/zagrodny-slifkin.toml"} <= wanted
+    assert {
+        "jaxmuscle/py.typed",
+        f"jaxmuscle/targets/{TARGET}.toml",
+        "jaxmuscle/presets/zagrodny-slifkin.toml",
+    } <= wanted
 
 
 def test_metadata_of_the_wheel(built):
@@ -75,22 +106,52 @@ def test_metadata_of_the_wheel(built):
     archive = zipfile.ZipFile(wheel)
     folder = f"jaxmuscle-{jm.__version__}.dist-info"
     data = email.message_from_bytes(archive.read(f"{folder}/METADATA"))
-    assert (data["Name"], data["Version"], data["License-Expression"]) == ("jaxmuscle", jm.__version__, "Apache-2.0")
+    assert (data["Name"], data["Version"], data["License-Expression"]) == (
+        "jaxmuscle",
+        jm.__version__,
+        "Apache-2.0",
+    )
     assert data["Description-Content-Type"] == "text/markdown"
-    assert set(data.get_all("Provides-Extra", [])) == {"all", "c3d", "kernel", "labs", "notebooks", "posterior", "url"}
+    assert set(data.get_all("Provides-Extra", [])) == {
+        "all",
+        "c3d",
+        "kernel",
+        "labs",
+        "notebooks",
+        "posterior",
+        "url",
+    }
     assert f"{folder}/licenses/LICENSE" in archive.namelist()
     assert archive.read(f"{folder}/entry_points.txt").decode().split() == [
-        "[console_scripts]", "jaxmuscle", "=", "jaxmuscle.__main__:main",
-    ]  # fmt: skip
+        "[console_scripts]",
+        "jaxmuscle",
+        "=",
+        "jaxmuscle.__main__:main",
+    ]
 
 
 def test_sdist_holds_what_users_and_packagers_need(built):
     (archive,) = built.glob("*.tar.gz")
     with tarfile.open(archive) as sdist:
         names = {name.partition("/")[2] for name in sdist.getnames()}
-    assert {"README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "Makefile", "pyproject.toml", "mkdocs.yml"} <= names
-    assert {"tests/conftest.py", "docs/index.md", "notebooks/01-first-fit.ipynb", "fitting/expected.py"} <= names
-    assert not [name for name in names if re.match(r"(\.venv|out|site|\.test-out|\.git)(/|$)", name)]
+    assert {
+        "README.md",
+        "LICENSE",
+        "CHANGELOG.md",
+        "CITATION.cff",
+        "Makefile",
+        "pyproject.toml",
+        "mkdocs.yml",
+    } <= names
+    assert {
+        "tests/conftest.py",
+        "docs/index.md",
+        "notebooks/01-first-fit.ipynb",
+        "fitting/expected.py",
+    } <= names
+    assert not [
+        name for name in names if re.match(r"(\.venv|out|site|\.test-out|\.git)(/|$)", name)
+    ]
 
 
 @pytest.mark.slow
@@ -98,12 +159,18 @@ def test_the_installed_package_is_the_wheels_and_has_one_version(installed):
     program = """
 import importlib.metadata, json, sys, jaxmuscle as jm
 version = importlib.metadata.version("jaxmuscle")
-print(json.dumps([sys.prefix, jm.__file__, version, jm.__version__, jm.list_targets(), jm.list_presets()]))
+found = [sys.prefix, jm.__file__, version, jm.__version__, jm.list_targets(), jm.list_presets()]
+print(json.dumps(found))
 """
     python = installed / "clean" / "bin" / "python"
     prefix, file, *rest = json.loads(run(python, "-c", program, cwd=installed))
     assert Path(prefix) == installed / "clean" and Path(file).is_relative_to(prefix)
-    assert rest == [jm.__version__, jm.__version__, list(jm.list_targets()), list(jm.list_presets())]
+    assert rest == [
+        jm.__version__,
+        jm.__version__,
+        list(jm.list_targets()),
+        list(jm.list_presets()),
+    ]
 
 
 @pytest.mark.slow
@@ -111,7 +178,9 @@ def test_the_installed_command_fits_a_bundled_target(installed):
     command = installed / "clean" / "bin" / "jaxmuscle"
     assert run(command, "--version", cwd=installed).split() == ["jaxmuscle", jm.__version__]
     users = {"XLA_FLAGS": ""}  # not the tests' quick compiler
-    assert "simulate.png" in run(command, "simulate", "zagrodny-slifkin", "--seeds", "2", cwd=installed, **users)
+    assert "simulate.png" in run(
+        command, "simulate", "zagrodny-slifkin", "--seeds", "2", cwd=installed, **users
+    )
     assert (installed / "out" / "simulate.png").read_bytes().startswith(b"\x89PNG")
     printed = run(command, "fit", TARGET, "--starts", "20", "--out", "out", cwd=installed)
     assert (installed / "out" / "spectrum-other.csv").exists()  # that of the simulation

@@ -1,4 +1,5 @@
-"""The Python of README and documentation does what it says; commands in them have the options that they are given."""
+"""The Python of README and documentation does what it says; commands in them have the options that
+they are given."""
 
 import contextlib
 import functools
@@ -22,48 +23,74 @@ from jaxmuscle.uncertainty import _profile
 
 TRUTH = jm.Isometric().replace(harmonic_frequency=6.0, harmonic_amplitude=0.012)
 ELSEWHERE = {
-    "docs/digitise.md": "data/test_digitised.py", "docs/own-muscle.md": "whole/test_hill.py",
-    "docs/perturbed.md": "data/test_perturbed.py", "docs/perturbed-design.md": "uncertainty/test_input_design.py",
+    "docs/digitise.md": "data/test_digitised.py",
+    "docs/own-muscle.md": "whole/test_hill.py",
+    "docs/perturbed.md": "data/test_perturbed.py",
+    "docs/perturbed-design.md": "uncertainty/test_input_design.py",
     "docs/study.md": "fits/test_study.py",
-}  # fmt: skip
+}
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
-    "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
-    "docs/fitting.md", "docs/force.md", "docs/how-to/own-noise.md", "docs/how-to/own-optimiser.md",
-    "docs/how-to/report-results.md", "docs/identifiability.md", "docs/index.md", "docs/python.md", "docs/recordings.md",
-    "docs/reference/figures.md", "docs/scaling.md", "docs/tutorial.md", "docs/uncertainty.md",
-}  # fmt: skip
-# Data with a rhythm are also tried with a tremor: two more programs of each fit, which fits/test_rungs.py has.
+    "README.md",
+    "docs/coming-from-diffrax.md",
+    "docs/coming-from-matlab.md",
+    "docs/ensembles.md",
+    "docs/fit-a-csv.md",
+    "docs/fitting.md",
+    "docs/force.md",
+    "docs/how-to/own-noise.md",
+    "docs/how-to/own-optimiser.md",
+    "docs/how-to/report-results.md",
+    "docs/identifiability.md",
+    "docs/index.md",
+    "docs/python.md",
+    "docs/recordings.md",
+    "docs/reference/figures.md",
+    "docs/scaling.md",
+    "docs/tutorial.md",
+    "docs/uncertainty.md",
+}
+# Data with a rhythm are also tried with a tremor: two more programs of each fit, which
+# fits/test_rungs.py has.
 FEW = "rungs=0, starts=16, seeds=16, check_seeds=16"
 OF_TRIALS = {'"trial3.csv"])  # the trials': f'"trial3.csv"], {FEW})  # the trials'}
 
 
 def jitted(*functions: str) -> dict[str, str]:
-    """What is called outside `jit` is traced anew each time: the gradient of the README alone is left so."""
+    """What is called outside `jit` is traced anew each time: the gradient of the README alone is
+    left so."""
     return {f"{function}(": f"jax.jit({function})(" for function in functions}
 
 
-# The bundled spectrum with the usual settings (see `write_plain`), and its fit, of which is asked what to measure next.
+# The bundled spectrum with the usual settings (see `write_plain`), and its fit, of which is asked
+# what to measure next.
 PLAIN = 'jm.load_target("plain.toml")'
 PLAIN_FIT = f"jm.fit(jm.task_for({PLAIN}), {PLAIN}, {FEW})"
 IN_PYTHON = {
-    "seeds=100_000": "seeds=100", "seeds=1000)": "seeds=100)",
-    "summary = jm.ensemble(result.task": "summary = jm.ensemble(jm.Isometric()",  # as docs/ensembles.md has it
+    "seeds=100_000": "seeds=100",
+    "seeds=1000)": "seeds=100)",
+    # as docs/ensembles.md has it
+    "summary = jm.ensemble(result.task": "summary = jm.ensemble(jm.Isometric()",
     "jm.identifiability(result)": f"jm.identifiability({PLAIN_FIT})",
     "jm.design_input(result,": f"jm.design_input({PLAIN_FIT},",
-} | jitted("jax.grad(variation)", "jax.grad(lambda v: jm.expected_spectrum(rebuild(v)).proportional[10])")  # fmt: skip
+} | jitted(
+    "jax.grad(variation)", "jax.grad(lambda v: jm.expected_spectrum(rebuild(v)).proportional[10])"
+)
 FULL = "starts=32, seeds=16, check_seeds=16"
-# What a notebook does as the README does is done as there. The ladder, tremor and all, is climbed in fits/test_rungs.py.
+# What a notebook does as the README does is done as there. The ladder, tremor and all, is climbed
+# in fits/test_rungs.py.
 IN_NOTEBOOKS = {
     "01-first-fit": {"fix=held": f"fix=held, {FEW}"},
     "02-monte-carlo-ensemble": {"seeds=1000": "seeds=100"},
     pages.IN_A_KERNEL: {
-        "plt.show()": "None",  # where there is no screen
+        "plt.show()": "None"  # where there is no screen
     },
     "04-from-recording-to-parameters": {"target, starts=40": f"target, {FEW}"},
     "05-uncertainty-and-noise-colour": {
         f"target, {FULL}": "target",
-        'task, target, noises=("band-limited", "ornstein-uhlenbeck"), groups=3': "jm.Isometric(), target",
+        'task, target, noises=("band-limited", "ornstein-uhlenbeck"), groups=3': (
+            "jm.Isometric(), target"
+        ),
         f"jm.Isometric(), measured, {FULL}": f"person, measured, {FEW}",
         "hand = result.task": f"result = {PLAIN_FIT}\nhand = result.task",
         # In the precision of the fit's own simulations: one program.
@@ -73,7 +100,9 @@ IN_NOTEBOOKS = {
     "06-gradients-and-design": {
         "jax.jvp(spread, (k_w,), (1.0,))": "jax.jit(lambda k: jax.jvp(spread, (k,), (1.0,)))(k_w)",
         # The slopes of the force are known, from a cell before.
-        "jax.jacfwd(log_power)(centre, task)": "(slopes if task is person else jax.jacfwd(log_power)(centre, task))",
+        "jax.jacfwd(log_power)(centre, task)": (
+            "(slopes if task is person else jax.jacfwd(log_power)(centre, task))"
+        ),
         **jitted("jax.grad(spread)"),
     },
     "07-your-own-muscle": {
@@ -81,7 +110,8 @@ IN_NOTEBOOKS = {
         '"paper\'s, as printed": jm.Isometric(), ': "",  # the muscle of all other pages
         **jitted(
             "jax.vmap(variation, in_axes=(None, 0))",
-            "jax.grad(lambda damping: jm.expected_spectrum(mine.replace(damping=damping)).proportional[0])",
+            "jax.grad(lambda damping:"
+            " jm.expected_spectrum(mine.replace(damping=damping)).proportional[0])",
         ),
     },
     "08-perturb-and-measure": {
@@ -89,8 +119,19 @@ IN_NOTEBOOKS = {
         "starts=16)": "starts=4, seeds=0, check_seeds=0)",
     },
 }
-CALLED_OFTEN = ("fit", "fit_cohort", "ensemble", "profile", "posterior", "identifiability", "compare_noise", "goodness",
-                "bootstrap", "design_input", "sensitivity")  # fmt: skip
+CALLED_OFTEN = (
+    "fit",
+    "fit_cohort",
+    "ensemble",
+    "profile",
+    "posterior",
+    "identifiability",
+    "compare_noise",
+    "goodness",
+    "bootstrap",
+    "design_input",
+    "sensitivity",
+)
 FEWER: dict[str, dict[str, Any]] = {
     "ensemble": {"chunk": 16},  # one program for any number of seeds
     "fit_cohort": {"starts": 8},
@@ -115,7 +156,9 @@ def recorded(key):
     run = jm.simulate(jm.settled(TRUTH), jax.random.key(key), duration=40.0, rate=1000.0)
     held = np.interp(np.arange(40 * 2048) / 2048, run.time, np.asarray(run.output, dtype=float))
     level = held.mean()
-    force = np.concatenate([np.zeros(4096), level * np.linspace(0, 1, 4096), held, level * np.linspace(1, 0, 2048)])
+    force = np.concatenate(
+        [np.zeros(4096), level * np.linspace(0, 1, 4096), held, level * np.linspace(1, 0, 2048)]
+    )
     rows = "".join(f"{k / 2048:.6f},{f:.6f}\n" for k, f in enumerate(force))
     return "time,force\n" + rows
 
@@ -129,17 +172,23 @@ def write_tremor(path):
     """What an accelerometer writes: 1000 Hz, in g, with gravity."""
     task = jm.settled(jm.PrescribedForce(observe="acceleration"))
     run = jm.simulate(task, jax.random.key(6), duration=30.0, rate=1000.0)
-    rows = "".join(f"{t:.3f},{a / 9.81 + 0.5:.8f}\n" for t, a in zip(run.time, np.asarray(run.output), strict=True))
+    rows = "".join(
+        f"{t:.3f},{a / 9.81 + 0.5:.8f}\n"
+        for t, a in zip(run.time, np.asarray(run.output), strict=True)
+    )
     Path(path).write_text("time,acc\n" + rows, encoding="utf-8")
 
 
 def write_plain(path):
-    """The bundled spectrum, as if its signal had been low-passed only once, as by the usual settings.
+    """The bundled spectrum, as if its signal had been low-passed only once, as by the usual
+    settings.
 
     Every choice of settings has programs of its own, and other tests make those of the usual ones.
     What the pages say is the same.
     """
-    text = (pages.ROOT / "src/jaxmuscle/targets/vastus-lateralis-26mvc.toml").read_text(encoding="utf-8")
+    text = (pages.ROOT / "src/jaxmuscle/targets/vastus-lateralis-26mvc.toml").read_text(
+        encoding="utf-8"
+    )
     bundled, settings = text.split("[settings]")
     assert settings.split() == ["filter_direction", "=", '"both"']
     Path(path).write_text(bundled, encoding="utf-8")
@@ -150,7 +199,9 @@ def write_spectrum(path, seed=0, task=None):
     expected = np.asarray(jm.expected_spectrum(TRUTH if task is None else task).proportional)
     power = expected * np.random.default_rng(seed).chisquare(24, expected.size) / 24
     frequency = jm.SpectrumSettings().frequency
-    rows = "".join(f"{f:.6f},{p:.6g}\n" for f, p in zip(frequency, power / power.sum(), strict=True))
+    rows = "".join(
+        f"{f:.6f},{p:.6g}\n" for f, p in zip(frequency, power / power.sum(), strict=True)
+    )
     Path(path).write_text("frequency_hz,proportional_power\n" + rows, encoding="utf-8")
 
 
@@ -163,14 +214,16 @@ def test_every_page_with_python_is_run():
 
 @pytest.fixture(scope="module", autouse=True)
 def once():
-    """Pages and notebooks do the same first fit, a dozen times: what they call with the same arguments is run once."""
+    """Pages and notebooks do the same first fit, a dozen times: what they call with the same
+    arguments is run once."""
     done = pages.Once()
     with pytest.MonkeyPatch.context() as patch:
-        # Two chains of 150 draws: R-hat scatters by some 0.02 about 1. test_posterior.py draws chains that must mix.
+        # Two chains of 150 draws: R-hat scatters by some 0.02 about 1. test_posterior.py draws
+        # chains that must mix.
         for name, bound in (("MIXED", 1.2), ("NEARLY", 1.4), ("EFFECTIVE", 5), ("DIVERGING", 0.05)):
             patch.setattr(_mixing, name, bound)
-        # Profiles of few points, along one of several maxima, and intervals of few steps. No page says what these end at:
-        # uncertainty/test_posterior.py and fits/test_intervals.py do.
+        # Profiles of few points, along one of several maxima, and intervals of few steps. No page
+        # says what these end at: uncertainty/test_posterior.py and fits/test_intervals.py do.
         for name, value in (("STEPS", np.array([1.2, 2.5])), ("FAR", np.log([30.0])), ("MODES", 1)):
             patch.setattr(_profile, name, value)
         patch.setattr(_half_power, "TURNS", 3)
@@ -189,7 +242,9 @@ def readme(once, tmp_path_factory):
             write_spectrum(f"{name}.csv", seed)
         write_plain("plain.toml")
         with contextlib.redirect_stdout(io.StringIO()) as printed:
-            names = pages.run("docs/python.md", pages.run("README.md", {"printed": printed}, OF_TRIALS), IN_PYTHON)
+            names = pages.run(
+                "docs/python.md", pages.run("README.md", {"printed": printed}, OF_TRIALS), IN_PYTHON
+            )
     return names | {"returned": dict(once.last)}
 
 
@@ -207,7 +262,8 @@ def test_readme(readme):
     assert found.divergences <= 6  # of 300; whole chains have none
     summary = found.summary()
     for name, derived in result.derived.items():
-        if derived.stderr is not None:  # the least-squares estimate lies well inside the posterior: 3 of 300 draws beyond it
+        # the least-squares estimate lies well inside the posterior: 3 of 300 draws beyond it
+        if derived.stderr is not None:
             draws = found.quantities[name]
             low, high = np.quantile(draws, [0.01, 0.99])
             assert low < derived.value < high and summary[name]["low"] < summary[name]["high"], name
@@ -222,21 +278,29 @@ def test_ensembles(readme):
 
 @pytest.mark.slow
 def test_uncertainty(readme):
-    assert pages.run("docs/uncertainty.md")["found"] is readme["found"]  # the same draws, which take a minute
+    # the same draws, which take a minute
+    assert pages.run("docs/uncertainty.md")["found"] is readme["found"]
     assert Path("posterior.nc").exists()
 
 
 @pytest.mark.slow
 def test_tutorial_and_front_page():
     # The target is the bundled one, written and read again.
-    few = {"jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})", "fix=known": f"fix=known, {FEW}"}
+    few = {
+        "jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})",
+        "fix=known": f"fix=known, {FEW}",
+    }
     names = pages.run("docs/tutorial.md", {}, few)
     assert "harmonic_frequency" in names["sharper"].free and jm.load_result("mine.json").success
     assert pages.run("docs/index.md", {}, {"seeds=1000)": "seeds=100)"})["result"].success
     reported = pages.run("docs/how-to/report-results.md")["determined"]
-    assert {"corner_frequency", "coefficient_of_variation"} <= set(reported["quantity"]) and Path("table.csv").exists()
+    assert {"corner_frequency", "coefficient_of_variation"} <= set(reported["quantity"]) and Path(
+        "table.csv"
+    ).exists()
     few = {"mean_force=(40.5, 0.8)": f"mean_force=(40.5, 0.8), {FEW}"}
-    assert pages.run("docs/fitting.md", {}, few)["in_newtons"].derived["mean"].value == pytest.approx(40.5, abs=3 * 0.8)
+    assert pages.run("docs/fitting.md", {}, few)["in_newtons"].derived[
+        "mean"
+    ].value == pytest.approx(40.5, abs=3 * 0.8)
 
 
 @pytest.mark.slow
@@ -251,13 +315,19 @@ def test_force():
 
 @pytest.mark.slow
 def test_identifiability():
-    write_spectrum("displacement.csv", task=TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w, F_ext=2.93))
+    write_spectrum(
+        "displacement.csv", task=TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w, F_ext=2.93)
+    )
     # What tests/uncertainty/test_several.py runs on less.
-    fewer = {'jm.load_target("vastus-lateralis-26mvc")': PLAIN,
-             "jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})",
-             "(2.93, 0.06)},": "(2.93, 0.06)}, starts=16, seeds=16, check_seeds=16,",
-             'jm.profile(joint, "K_w0")': 'joint["K_w0"]', "jm.bootstrap(joint)": "", "jm.posterior(joint, key=0)": "",
-             "jm.goodness(joint)": "jm.goodness(joint, replicates=19)"}  # fmt: skip
+    fewer = {
+        'jm.load_target("vastus-lateralis-26mvc")': PLAIN,
+        "jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})",
+        "(2.93, 0.06)},": "(2.93, 0.06)}, starts=16, seeds=16, check_seeds=16,",
+        'jm.profile(joint, "K_w0")': 'joint["K_w0"]',
+        "jm.bootstrap(joint)": "",
+        "jm.posterior(joint, key=0)": "",
+        "jm.goodness(joint)": "jm.goodness(joint, replicates=19)",
+    }
     names = pages.run("docs/identifiability.md", {}, fewer)
     assert len(names["report"].designs) == 4 and jm.load_result("joint.json").success
 
@@ -271,9 +341,11 @@ def test_own_data():
     write_tremor("tremor.csv")
     # With a tremor at once: the program of the fit that fits/test_tremor.py makes.
     few = "rungs=0, starts=8, seeds=0, check_seeds=0"
-    quick = {"jm.task_for(tremor), tremor": f"jm.on_rung(jm.task_for(tremor), 2), tremor, {few}",
-             "held.target())\n": f"held.target(), {FEW})\n",
-             "target)  # the same": f"target, {FEW})  # the same"}  # fmt: skip
+    quick = {
+        "jm.task_for(tremor), tremor": f"jm.on_rung(jm.task_for(tremor), 2), tremor, {few}",
+        "held.target())\n": f"held.target(), {FEW})\n",
+        "target)  # the same": f"target, {FEW})  # the same",
+    }
     names = pages.run("docs/recordings.md", {}, quick)
     assert names["result"].success and names["moving"].task.quantity == "acceleration"
     assert Path("trial.png").exists()
@@ -282,7 +354,9 @@ def test_own_data():
 @pytest.mark.slow
 def test_coming_from_elsewhere():
     pages.run("docs/coming-from-matlab.md")
-    whole = jitted("jax.jacfwd(last)", "jax.grad(last)", "jax.grad(lambda v: jnp.sum(misfit(v) ** 2))")
+    whole = jitted(
+        "jax.jacfwd(last)", "jax.grad(last)", "jax.grad(lambda v: jnp.sum(misfit(v) ** 2))"
+    )
     with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of two lengths
         names = pages.run("docs/coming-from-diffrax.md", {}, whole)
         first = float(names["loss"]((names["logs"], names["Sensor"](jax.numpy.asarray(-5.0)))))
@@ -291,7 +365,8 @@ def test_coming_from_elsewhere():
     # Welch power of one recording scatters by half, so the mean of eight by less than a fifth.
     assert 0.2 < names["many"].mean() / float(jm.expected_spectrum(jm.Isometric()).power[10]) < 1.8
     assert set(names["slopes"]) == {"c_w", "noise_K_z"}
-    assert names["better"]["c_w"] == pytest.approx(191.9, rel=0.01)  # Levenberg-Marquardt stops within 1e-2 of a coordinate
+    # Levenberg-Marquardt stops within 1e-2 of a coordinate
+    assert names["better"]["c_w"] == pytest.approx(191.9, rel=0.01)
 
 
 @pytest.mark.slow
@@ -299,8 +374,13 @@ def test_own_optimisers():
     """scipy's minimum, found as the page says, is that of the fit with another optimiser."""
     try:
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of two lengths
-            # The second descent with the slopes of the first: those of its own residuals differ only in what weighs them.
-            names = pages.run("docs/how-to/own-optimiser.md", {}, {"jax.jit(jax.jacfwd(closer.residuals))": "slopes"})
+            # The second descent with the slopes of the first: those of its own residuals differ
+            # only in what weighs them.
+            names = pages.run(
+                "docs/how-to/own-optimiser.md",
+                {},
+                {"jax.jit(jax.jacfwd(closer.residuals))": "slopes"},
+            )
         problem = names["problem"]
         assert problem.log_density(names["theta"]) > problem.log_density(problem.start)
     finally:
@@ -310,13 +390,21 @@ def test_own_optimisers():
 
 @pytest.mark.slow
 def test_own_noise():
-    # The ensemble has the precision of a fit's simulations, which then needs none (model/test_noise.py has the single one).
-    ensemble = ("runs = jm.ensemble(task, jax.random.key(0), seeds=16)", "estimate = runs.mean_spectrum()")
-    few = {"\n".join(ensemble): "\n    ".join(("with jax.enable_x64(True):", *ensemble)),
-           "rungs=0, starts=8": "rungs=0, starts=8, seeds=0, check_seeds=0"}  # fmt: skip
+    # The ensemble has the precision of a fit's simulations, which then needs none
+    # (model/test_noise.py has the single one).
+    ensemble = (
+        "runs = jm.ensemble(task, jax.random.key(0), seeds=16)",
+        "estimate = runs.mean_spectrum()",
+    )
+    few = {
+        "\n".join(ensemble): "\n    ".join(("with jax.enable_x64(True):", *ensemble)),
+        "rungs=0, starts=8": "rungs=0, starts=8, seeds=0, check_seeds=0",
+    }
     names = pages.run("docs/how-to/own-noise.md", {}, few)
     assert names["result"].success and 0.05 < names["result"].task["noise_corner"] < 20
-    assert np.max(np.abs(names["estimate"].nonlinearity)) < 0.05 and np.isfinite(names["slope"]).all()
+    assert (
+        np.max(np.abs(names["estimate"].nonlinearity)) < 0.05 and np.isfinite(names["slope"]).all()
+    )
 
 
 @pytest.mark.slow
@@ -334,7 +422,8 @@ def test_scaling():
 @pytest.mark.slow
 @pytest.mark.parametrize("path", pages.NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebooks_run(path, once):
-    """Their cells one after another, here: what they have in common with the pages is not compiled and fitted again."""
+    """Their cells one after another, here: what they have in common with the pages is not compiled
+    and fitted again."""
     try:
         with plt.rc_context():
             pages.run_cells(path, IN_NOTEBOOKS.get(path.stem))
@@ -354,7 +443,9 @@ def test_commands_in_pages_exist_with_their_options(page):
     text = page.read_text(encoding="utf-8")
     for line in re.findall(r"(?:^ +|`)jaxmuscle (?!COMMAND)([a-z][^`\n]*)", text, re.MULTILINE):
         command, _, rest = line.partition("  #")[0].partition(" ")
-        unknown = set(re.findall(r"(?<!\S)\[?(--[a-z][\w-]*)", rest)) - OPTIONS[command] - {"--help"}
+        unknown = (
+            set(re.findall(r"(?<!\S)\[?(--[a-z][\w-]*)", rest)) - OPTIONS[command] - {"--help"}
+        )
         assert not unknown, line
 
 
@@ -365,7 +456,9 @@ FIGURES = [figure for section in GALLERY.SECTIONS for figure in section.figures]
 
 
 def test_the_gallery_shows_every_figure():
-    assert GALLERY.PAGE.read_text(encoding="utf-8") == GALLERY.page(), "run `python docs/gallery.py`"
+    assert GALLERY.PAGE.read_text(encoding="utf-8") == GALLERY.page(), (
+        "run `python docs/gallery.py`"
+    )
     public = {name for name in jm.plot.__all__ if callable(getattr(jm.plot, name))} - {"styled"}
     shown = {Path(figure.file).stem for figure in FIGURES}
     assert public <= shown
@@ -374,48 +467,92 @@ def test_the_gallery_shows_every_figure():
 
 
 def unlabelled(figure):
-    """Axes with numbers but no words at them. (Where they stand is no matter here: plot/test_plot.py has the layout.)"""
+    """Axes with numbers but no words at them. (Where they stand is no matter here:
+    plot/test_plot.py has the layout.)"""
     figure.set_layout_engine("none")
     figure.draw_without_rendering()
     for ax in figure.get_axes():
         for axis in (ax.xaxis, ax.yaxis) if ax.axison else ():
-            texts = [tick.label1.get_text() for tick in axis.get_major_ticks() if tick.label1.get_visible()]
-            numbers = [text for text in texts if any(c.isdigit() for c in text) and not any(c.isalpha() for c in text)]
+            texts = [
+                tick.label1.get_text()
+                for tick in axis.get_major_ticks()
+                if tick.label1.get_visible()
+            ]
+            numbers = [
+                text
+                for text in texts
+                if any(c.isdigit() for c in text) and not any(c.isalpha() for c in text)
+            ]
             if numbers and not axis.get_label().get_text():
                 yield ax.get_title("left") or ax.get_title(), axis.axis_name, numbers
 
 
 @pytest.mark.slow
 def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(readme, monkeypatch):
-    """The statements of the README's results are those of the gallery: what takes minutes is not done twice."""
-    for name in ("posterior", "identifiability", "compare_noise", "goodness", "bootstrap", "design_input", "sensitivity"):
+    """The statements of the README's results are those of the gallery: what takes minutes is not
+    done twice."""
+    for name in (
+        "posterior",
+        "identifiability",
+        "compare_noise",
+        "goodness",
+        "bootstrap",
+        "design_input",
+        "sensitivity",
+    ):
         monkeypatch.setattr(jm, name, lambda *_, found=readme["returned"][name], **__: found)
     smaller = {
-        "seeds=200)": "seeds=100)", "seeds=2000": "seeds=100", "seeds=100), strict": "seeds=16), strict",
+        "seeds=200)": "seeds=100)",
+        "seeds=2000": "seeds=100",
+        "seeds=100), strict": "seeds=16), strict",
         # Recordings as long as others here.
         "jm.ensemble(jm.settled(result.task), key, seeds=5, duration=20.0)": "runs",
         "enumerate(np.asarray(seeds.output))": "enumerate(np.asarray(seeds.output)[:5])",
-        "key, duration=60.0, rate=1000.0": "key, duration=40.0, rate=1000.0", "window=(2.0, 60.0)": "window=(2.0, 40.0)",
-    }  # fmt: skip
+        "key, duration=60.0, rate=1000.0": "key, duration=40.0, rate=1000.0",
+        "window=(2.0, 60.0)": "window=(2.0, 40.0)",
+    }
     for old in smaller:
-        assert any(old in section.setup for section in GALLERY.SECTIONS), f"the gallery says no longer {old}"
+        assert any(old in section.setup for section in GALLERY.SECTIONS), (
+            f"the gallery says no longer {old}"
+        )
     names, few = dict(readme), FEW.replace("starts=16", "starts=4")
-    for section in GALLERY.SECTIONS[:-2]:  # the paper's figures and a study, which fits/test_study.py does
-        exec(functools.reduce(lambda setup, old: setup.replace(old, smaller[old]), smaller, section.setup), names)
+    # the paper's figures and a study, which fits/test_study.py does
+    for section in GALLERY.SECTIONS[:-2]:
+        exec(
+            functools.reduce(
+                lambda setup, old: setup.replace(old, smaller[old]), smaller, section.setup
+            ),
+            names,
+        )
         for figure in section.figures:
-            code = figure.code.replace(", minute)", f", minute, {few})").replace("tasks=pair)", f"tasks=pair, {few})")
-            made = eval(code.replace("high_frequency_floor", "corner_frequency"), names)  # this profile is there
+            code = figure.code.replace(", minute)", f", minute, {few})").replace(
+                "tasks=pair)", f"tasks=pair, {few})"
+            )
+            # this profile is there
+            made = eval(code.replace("high_frequency_floor", "corner_frequency"), names)
             whole = getattr(made[0] if isinstance(made, tuple) else made, "figure", made)
             assert not list(unlabelled(whole)), figure.file
             plt.close("all")
     for draw, result in (
-        ("fit", names["result"]), ("simulation", names["runs"]), ("posterior", names["found"]), ("chains", names["found"]),
-        ("comparison", jm.compare_noise()), ("identifiability", jm.identifiability()), ("goodness", jm.goodness()),
-        ("bootstrap", jm.bootstrap()), ("cohort", names["cohort"]), ("recording", names["recording"]),
+        ("fit", names["result"]),
+        ("simulation", names["runs"]),
+        ("posterior", names["found"]),
+        ("chains", names["found"]),
+        ("comparison", jm.compare_noise()),
+        ("identifiability", jm.identifiability()),
+        ("goodness", jm.goodness()),
+        ("bootstrap", jm.bootstrap()),
+        ("cohort", names["cohort"]),
+        ("recording", names["recording"]),
         ("trials", jm.Trials(names["trials"])),
-    ):  # fmt: skip
+    ):
         figure, (mine, place) = plt.subplots(1, 2, figsize=(20.0, 12.0), layout="constrained")
         part = getattr(jm.plot, draw)(result, ax=place)
         figure.draw_without_rendering()
-        assert part.figure is figure and mine in figure.axes and place not in figure.axes and len(figure.axes) > 2, draw
+        assert (
+            part.figure is figure
+            and mine in figure.axes
+            and place not in figure.axes
+            and len(figure.axes) > 2
+        ), draw
         plt.close(figure)

@@ -1,4 +1,5 @@
-"""The programs of the design document run as written; those that the README has too are in test_pages.py."""
+"""The programs of the design document run as written; those that the README has too are in
+test_pages.py."""
 
 import jax
 import numpy as np
@@ -14,7 +15,11 @@ def test_the_papers_tasks():
     ax = jm.simulate(task1, jax.random.key(1)).plot()
     task2 = task1.as_task(jm.PrescribedForce)
     assert "P" in ax.get_ylabel()
-    assert task2.muscle is task1.muscle and task2.noise is task1.noise and task2.harmonic is task1.harmonic
+    assert (
+        task2.muscle is task1.muscle
+        and task2.noise is task1.noise
+        and task2.harmonic is task1.harmonic
+    )
 
 
 @pytest.mark.slow
@@ -38,7 +43,9 @@ def test_a_users_own_muscle_has_noise_spectra_and_gradients():
         damping: float = 40.0
 
         def base(self):
-            return jax.numpy.stack([jax.numpy.asarray(v) * 1.0 for v in (self.stiffness, 200.0, self.damping, 5.0)])
+            return jax.numpy.stack(
+                [jax.numpy.asarray(v) * 1.0 for v in (self.stiffness, 200.0, self.damping, 5.0)]
+            )
 
         def active_force(self, x_w, v_w, u):
             return (self.stiffness + u[0]) * x_w + (self.damping + u[2]) * v_w
@@ -52,12 +59,15 @@ def test_a_users_own_muscle_has_noise_spectra_and_gradients():
     for kind in (jm.Isometric, jm.PrescribedForce, jm.PrescribedMotion):
         task = kind(muscle=Linear())
         assert task["stiffness"] == 300.0
-    # The last, a motion, asks for all its methods. `floor` simulates it held, test_expected.py at a prescribed force.
+    # The last, a motion, asks for all its methods. `floor` simulates it held, test_expected.py at a
+    # prescribed force.
     power = jm.ensemble(task, jax.random.key(0), seeds=8).spectrum().mean().proportional
     assert np.all(np.isfinite(power))
 
     def floor(stiffness):
-        moved = jm.simulate(jm.Isometric(muscle=Linear()).replace(stiffness=stiffness), jax.random.key(0))
+        moved = jm.simulate(
+            jm.Isometric(muscle=Linear()).replace(stiffness=stiffness), jax.random.key(0)
+        )
         return moved.spectrum().power[10]
 
     assert np.isfinite(at_once(jax.grad(floor), jax.numpy.asarray(300.0)))

@@ -29,7 +29,9 @@ def simulated(number):
 
 
 def reduced(number):
-    return jm.ensemble(TASK.replace(k_w=4e5 + 1e4 * number), KEY, seeds=16, duration=0.2, chunk=8, reduce=True).mean
+    return jm.ensemble(
+        TASK.replace(k_w=4e5 + 1e4 * number), KEY, seeds=16, duration=0.2, chunk=8, reduce=True
+    ).mean
 
 
 def in_double(number):
@@ -54,14 +56,16 @@ def pairs(run, jobs):
 
 @pytest.mark.slow
 def test_two_threads_50_times():
-    """In mixed order, with programs that are in memory and with ones that both threads miss; in both precisions.
+    """In mixed order, with programs that are in memory and with ones that both threads miss; in
+    both precisions.
 
     All are forgotten after ten jobs of each thread: it is the misses that threads could confuse.
     """
     kinds = [expected, simulated, reduced, in_double]
     rng = np.random.default_rng(3)
     jobs = [
-        (kinds[kind], int(number)) for kind, number in zip(rng.integers(0, 4, 100), rng.integers(0, 5, 100), strict=True)
+        (kinds[kind], int(number))
+        for kind, number in zip(rng.integers(0, 4, 100), rng.integers(0, 5, 100), strict=True)
     ]
     alone = {job: job[0](job[1]) for job in sorted(set(jobs), key=str)}
     for start in range(0, 100, 20):
@@ -73,7 +77,14 @@ def test_two_threads_50_times():
 
 
 def fit(key):
-    options = {"free": ("c_w", "noise_K_w"), "starts": 2, "seeds": 8, "check_seeds": 0, "rungs": 0, "max_steps": 8}
+    options = {
+        "free": ("c_w", "noise_K_w"),
+        "starts": 2,
+        "seeds": 8,
+        "check_seeds": 0,
+        "rungs": 0,
+        "max_steps": 8,
+    }
     return jm.fit(jm.Isometric(), jm.load_target("vastus-lateralis-26mvc"), key=key, **options)
 
 
@@ -89,14 +100,17 @@ def test_two_threads_fit():
 
 @pytest.mark.slow
 def test_two_threads_draw(monkeypatch):
-    """Two posteriors of one fit, in threads that both miss the sampler's programs; they are those of the README's posterior.
+    """Two posteriors of one fit, in threads that both miss the sampler's programs; they are those
+    of the README's posterior.
 
     Paths are a tenth as long, so that each draw takes few steps; the programs are the same.
     """
     monkeypatch.setattr(_chains, "LONGEST", 0.4)
 
     def drawn(key):
-        return jm.posterior(fit_alone(0), key=key, chains=2, draws=100, warmup=20, free=DEFAULT_FREE).samples
+        return jm.posterior(
+            fit_alone(0), key=key, chains=2, draws=100, warmup=20, free=DEFAULT_FREE
+        ).samples
 
     alone = [drawn(key) for key in range(2)]
     assert np.any(alone[0]["c_w"] != alone[1]["c_w"])

@@ -1,4 +1,5 @@
-"""What every wing may use: errors, files that are written whole, folded text, trees of numbers, progress.
+"""What every wing may use: errors, files that are written whole, folded text, trees of numbers,
+progress.
 
 It knows nothing of muscles, spectra or fits, and imports no other wing.
 """

@@ -1,4 +1,5 @@
-"""Numbers that a caller gives, checked: an error names the argument, its value and what is right."""
+"""Numbers that a caller gives, checked: an error names the argument, its value and what is
+right."""
 
 import math
 import operator
@@ -20,12 +21,21 @@ def is_real(value: Any) -> bool:
 def positive(name: str, value: Any, *, zero: bool = False) -> None:
     """Raise a `ValueError` unless the value is a finite number above 0, or with `zero` 0 itself."""
     if not (is_real(value) and (value > 0 or (zero and value == 0))):
-        raise ValueError(f"{name} = {value!r}: give a finite number {'of at least' if zero else 'above'} 0")
+        raise ValueError(
+            f"{name} = {value!r}: give a finite number {'of at least' if zero else 'above'} 0"
+        )
 
 
 def count(name: str, value: Any, least: int, most: int | None = None) -> None:
     """Raise a `ValueError` unless the value is a whole number in the range."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool | np.bool_)
-    if not whole or operator.index(value) < least or (most is not None and operator.index(value) > most):
+    if (
+        not whole
+        or operator.index(value) < least
+        or (most is not None and operator.index(value) > most)
+    ):
         upper = "" if most is None else f" to {most}"
-        raise ValueError(f"{name} = {value!r}: give a whole number {'from' if upper else 'of at least'} {least}{upper}")
+        raise ValueError(
+            f"{name} = {value!r}: give a whole number {'from' if upper else 'of at least'}"
+            f" {least}{upper}"
+        )

@@ -31,8 +31,11 @@ def require(condition: Any, message: str) -> None:
 
 
 def checked(tree: Any) -> Any:
-    """Run every `__check_init__` in a tree of modules, as its constructors would; returns the tree."""
-    for node in jax.tree.leaves(tree, is_leaf=lambda x: isinstance(x, eqx.Module) and x is not tree):
+    """Run every `__check_init__` in a tree of modules, as its constructors would; returns the
+    tree."""
+    for node in jax.tree.leaves(
+        tree, is_leaf=lambda x: isinstance(x, eqx.Module) and x is not tree
+    ):
         if isinstance(node, eqx.Module):
             checked(node)
     check = getattr(type(tree), "__check_init__", None)
@@ -42,7 +45,9 @@ def checked(tree: Any) -> Any:
 
 
 def _is_scalar(value: Any) -> bool:
-    return not isinstance(value, bool | str) and isinstance(value, float | int | np.ndarray | jax.Array | np.generic)
+    return not isinstance(value, bool | str) and isinstance(
+        value, float | int | np.ndarray | jax.Array | np.generic
+    )
 
 
 def as_arrays(tree: Any, dtype: Any = None) -> Any:
@@ -58,10 +63,11 @@ def as_arrays(tree: Any, dtype: Any = None) -> Any:
 
 
 def as_doubles(tree: Any) -> Any:
-    """`as_arrays` in double precision; of concrete numbers they are concrete even where a function is traced.
+    """`as_arrays` in double precision; of concrete numbers they are concrete even where a function
+    is traced.
 
-    What is compiled of them belongs outside `ensure_compile_time_eval`: in it every operation on constants that is traced
-    would be compiled by itself.
+    What is compiled of them belongs outside `ensure_compile_time_eval`: in it every operation on
+    constants that is traced would be compiled by itself.
     """
     with jax.ensure_compile_time_eval(), jax.enable_x64(True):
         return as_arrays(tree)
@@ -79,7 +85,8 @@ def as_numbers(tree: Any) -> Any:
 
 
 def with_nulls(values: Any) -> Any:
-    """A number, or an array as a flat list, for JSON: it has no word for what is not finite, so None there."""
+    """A number, or an array as a flat list, for JSON: it has no word for what is not finite, so
+    None there."""
     if values is None or isinstance(values, bool | int | str):
         return values
     if isinstance(values, float):
@@ -89,4 +96,8 @@ def with_nulls(values: Any) -> Any:
 
 def from_nulls(values: list[Any] | None) -> Any:
     """The array of a list that `with_nulls` made; None if there is none."""
-    return None if values is None else np.array([np.nan if v is None else v for v in values], dtype=float)
+    return (
+        None
+        if values is None
+        else np.array([np.nan if v is None else v for v in values], dtype=float)
+    )

@@ -1,4 +1,5 @@
-"""The bundled targets and presets by name; imports neither jax nor numpy, so that `jaxmuscle targets` answers at once."""
+"""The bundled targets and presets by name; imports neither jax nor numpy, so that `jaxmuscle
+targets` answers at once."""
 
 import tomllib
 from importlib import resources
@@ -44,7 +45,9 @@ def list_presets() -> tuple[str, ...]:
 
 def _names(folder: str) -> tuple[str, ...]:
     files = (resources.files("jaxmuscle") / folder).iterdir()
-    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
+    return tuple(
+        sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
+    )
 
 
 def bundled_text(name: str, folder: str = "targets") -> str:
@@ -61,4 +64,6 @@ def describe_targets() -> tuple[BundledTarget, ...]:
 def describe_presets() -> tuple[BundledPreset, ...]:
     """Name, task and description of every bundled preset."""
     tables = {name: tomllib.loads(bundled_text(name, "presets")) for name in list_presets()}
-    return tuple(BundledPreset(name, t["task_table"]["task"], t["description"]) for name, t in tables.items())
+    return tuple(
+        BundledPreset(name, t["task_table"]["task"], t["description"]) for name, t in tables.items()
+    )

@@ -21,8 +21,8 @@ FEW = 10  # numbers that are shown each
 class Card(NamedTuple):
     """What an object says of itself.
 
-    `text` is the whole of it. A notebook shows `heading`, the table of `columns` and `rows`, and `remarks`; the text where
-    there is no table.
+    `text` is the whole of it. A notebook shows `heading`, the table of `columns` and `rows`, and
+    `remarks`; the text where there is no table.
     """
 
     text: str
@@ -44,16 +44,24 @@ class Card(NamedTuple):
         head = _row("th", self.columns)
         body = "\n".join(_row("td", row) for row in self.rows)
         said = "".join(f"<p>{html.escape(remark)}</p>\n" for remark in self.remarks)
-        return (f'<div class="jaxmuscle">\n<p><b>{html.escape(self.heading)}</b></p>\n<table>\n<thead>{head}</thead>\n'
-                f"<tbody>\n{body}\n</tbody>\n</table>\n{said}</div>")  # fmt: skip
+        return (
+            f'<div class="jaxmuscle">\n<p><b>{html.escape(self.heading)}</b></p>\n'
+            f"<table>\n<thead>{head}</thead>\n"
+            f"<tbody>\n{body}\n</tbody>\n</table>\n{said}</div>"
+        )
 
 
 def _row(tag: str, cells: Iterable[str]) -> str:
-    return "<tr>" + "".join(f'<{tag} style="text-align: left">{html.escape(cell)}</{tag}>' for cell in cells) + "</tr>"
+    return (
+        "<tr>"
+        + "".join(f'<{tag} style="text-align: left">{html.escape(cell)}</{tag}>' for cell in cells)
+        + "</tr>"
+    )
 
 
 class Shown(abc.ABC):
-    """Shows itself as its card: the text where it is printed, with or without `print`, the table in a notebook."""
+    """Shows itself as its card: the text where it is printed, with or without `print`, the table in
+    a notebook."""
 
     @abc.abstractmethod
     def _card(self) -> Card:
@@ -70,12 +78,17 @@ class Spelled:
     """Shows itself as the call that makes it, with all fields and their numbers."""
 
     def __repr__(self) -> str:
-        fields = ", ".join(f"{field.name}={_spelled(getattr(self, field.name))}" for field in dataclasses.fields(self))  # pyright: ignore[reportArgumentType]
+        names = [field.name for field in dataclasses.fields(self)]  # pyright: ignore[reportArgumentType]
+        fields = ", ".join(f"{name}={_spelled(getattr(self, name))}" for name in names)
         return f"{type(self).__name__}({fields})"
 
 
 def _spelled(value: Any) -> str:
-    if isinstance(value, float | np.ndarray | np.generic | jax.Array) and is_concrete(value) and np.size(value) <= FEW:
+    if (
+        isinstance(value, float | np.ndarray | np.generic | jax.Array)
+        and is_concrete(value)
+        and np.size(value) <= FEW
+    ):
         return repr(np.asarray(value).tolist())
     return repr(value) if isinstance(value, Spelled | tuple) else eqx.tree_pformat(value)
 
@@ -100,16 +113,26 @@ class Result(Shown):
 
 def facts(heading: str, rows: Sequence[tuple[str, str]], width: int = 8) -> Card:
     """A card of a heading and named facts, a line for each; names are filled up to `width`."""
-    return Card(folded([heading, *(f"  {name:<{width}}  {value}" for name, value in rows)]), heading, ("", ""), tuple(rows))
+    return Card(
+        folded([heading, *(f"  {name:<{width}}  {value}" for name, value in rows)]),
+        heading,
+        ("", ""),
+        tuple(rows),
+    )
 
 
 def in_columns(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table as lines of at most 80 columns; words of the last column that find no room go on below."""
+    """A table as lines of at most 80 columns; words of the last column that find no room go on
+    below."""
     widths = [max(len(row[i]) for row in [columns, *rows]) + 2 for i in range(len(columns) - 1)]
     room = max(WIDTH - 2 - sum(widths), LEAST)
     lines = []
     for row in [columns, *rows]:
         words = textwrap.wrap(row[-1], room) or [""]
-        lines.append("  " + "".join(f"{cell:<{wide}}" for cell, wide in zip(row, widths, strict=False)) + words[0])
+        lines.append(
+            "  "
+            + "".join(f"{cell:<{wide}}" for cell, wide in zip(row, widths, strict=False))
+            + words[0]
+        )
         lines += [" " * (2 + sum(widths)) + more for more in words[1:]]
     return [line.rstrip() for line in lines]

@@ -1,4 +1,5 @@
-"""JSON and TOML that people may have changed: parsed strictly, and held against a schema that says what each key is."""
+"""JSON and TOML that people may have changed: parsed strictly, and held against a schema that says
+what each key is."""
 
 import json
 import math
@@ -14,25 +15,33 @@ from .text import choices, listed
 
 LARGEST = 2**63  # whole numbers from here on are none of anything that a file counts
 WORDS = {
-    "float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false", "null": "nothing",
-    "object": "a table", "array": "a list",
-}  # fmt: skip
+    "float": "a number",
+    "int": "a whole number",
+    "str": "a text",
+    "bool": "true or false",
+    "null": "nothing",
+    "object": "a table",
+    "array": "a list",
+}
 DISAGREE = 1e-9  # relative; numbers that follow from others may be rounded differently
 
 T = TypeVar("T")
 
 
 class Table(msgspec.Struct, forbid_unknown_fields=True):
-    """The schema of a table in a file: a field for each key, its type annotated with what it means."""
+    """The schema of a table in a file: a field for each key, its type annotated with what it
+    means."""
 
 
 def says(meaning: str, *, missing: str | None = None, kind: str | None = None) -> Meta:
-    """What a key of a table means; what its absence says, of one that may be `missing`; its type where code checks that."""
+    """What a key of a table means; what its absence says, of one that may be `missing`; its type
+    where code checks that."""
     return Meta(description=meaning, extra={"missing": missing, "kind": kind})
 
 
 def parsed(text: str, file: str, kind: str, error: type[ValueError] = ValueError) -> dict[str, Any]:
-    """The table of a JSON or TOML text (`kind`). Raises `error`, naming the file, also for a key that is there twice."""
+    """The table of a JSON or TOML text (`kind`). Raises `error`, naming the file, also for a key
+    that is there twice."""
     try:
         table = _json(text) if kind == "JSON" else tomllib.loads(text)
     except RecursionError:
@@ -48,8 +57,11 @@ def parsed(text: str, file: str, kind: str, error: type[ValueError] = ValueError
     return table
 
 
-def checked(table: dict[str, Any], kind: type[T], file: str, error: type[ValueError] = ValueError) -> T:
-    """The table as its schema `kind` has it. Raises `error` naming file and key: one missing, unknown or of a wrong type."""
+def checked(
+    table: dict[str, Any], kind: type[T], file: str, error: type[ValueError] = ValueError
+) -> T:
+    """The table as its schema `kind` has it. Raises `error` naming file and key: one missing,
+    unknown or of a wrong type."""
     fields = {field.encode_name: field.required for field in msgspec.structs.fields(kind)}  # pyright: ignore[reportArgumentType]
     for key in table:
         if key not in fields:
@@ -73,11 +85,14 @@ def converted(value: Any, kind: Any, where: str, error: type[ValueError] = Value
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as wrong:
-        raise error(f"{where} = {_shown(value)}: {_in_words(str(wrong)).removeprefix('the table ')}") from None
+        raise error(
+            f"{where} = {_shown(value)}: {_in_words(str(wrong)).removeprefix('the table ')}"
+        ) from None
 
 
 def contradiction(stated: Any, meant: Any, place: str = "", *, whole: bool = True) -> str | None:
-    """Where a table says something else than what follows from its other entries, in words; None if nowhere.
+    """Where a table says something else than what follows from its other entries, in words; None if
+    nowhere.
 
     Without `whole` it may leave something out: what an earlier version did not write.
     """
@@ -90,10 +105,13 @@ def contradiction(stated: Any, meant: Any, place: str = "", *, whole: bool = Tru
         pairs = [(f"[{i}]", *pair) for i, pair in enumerate(zip(stated, meant, strict=True))]
     else:
         return (
-            None if _same(stated, meant) else f"{place} is {_shown(stated)}, but the rest of the file means {_shown(meant)}"
+            None
+            if _same(stated, meant)
+            else f"{place} is {_shown(stated)}, but the rest of the file means {_shown(meant)}"
         )
     found = (
-        contradiction(one, other, f"{place}.{key}".lstrip(".").replace(".[", "["), whole=whole) for key, one, other in pairs
+        contradiction(one, other, f"{place}.{key}".lstrip(".").replace(".[", "["), whole=whole)
+        for key, one, other in pairs
     )
     return next(filter(None, found), None)
 
@@ -129,7 +147,8 @@ def _no_word(word: str) -> Any:
 
 
 def _leaves(value: Any) -> Iterator[tuple[str, Any]]:
-    """Names and values, the names' own text too; without recursion, so that no depth is too much."""
+    """Names and values, the names' own text too; without recursion, so that no depth is too
+    much."""
     stack = [("", value)]
     while stack:
         place, value = stack.pop()
@@ -153,15 +172,22 @@ def _impossible(value: Any) -> str | None:
 
 
 def _located(table: dict[str, Any], kind: Any, message: str) -> str:
-    """The message with the keys that msgspec leaves out where keys are free: the entry that alone is refused."""
+    """The message with the keys that msgspec leaves out where keys are free: the entry that alone
+    is refused."""
     while "[...]" in message:
         way = message.rpartition("`$")[2].partition("[...]")[0]
-        steps = [int(index) if index else name for name, index in re.findall(r"\.([^.\[\]`]+)|\[(\d+)\]", way)]
+        steps = [
+            int(index) if index else name
+            for name, index in re.findall(r"\.([^.\[\]`]+)|\[(\d+)\]", way)
+        ]
         holder: Any = table
         for step in steps:
             holder = holder[step]
         entries = holder.items()
-        wrong = next((key for key, entry in entries if _is_refused(_with(table, steps, {key: entry}), kind)), None)
+        wrong = next(
+            (key for key, entry in entries if _is_refused(_with(table, steps, {key: entry}), kind)),
+            None,
+        )
         if wrong is None:
             break
         message = message.replace("[...]", f".{wrong}", 1)
@@ -190,10 +216,18 @@ def _in_words(message: str) -> str:
     """What msgspec says, as people say it."""
     said, _, way = message.partition(" - at `$")
     place = way.removesuffix("`").removeprefix(".") or "the table"
-    said = re.sub(r"Object missing required field `(.*)`", r"has no key '\1', which is needed", said)
+    said = re.sub(
+        r"Object missing required field `(.*)`", r"has no key '\1', which is needed", said
+    )
     said = re.sub(r"Object contains unknown field `(.*)`", r"has the unknown key '\1'", said)
-    said = re.sub(r"^Expected `object` ", "must be a table ", said.replace("Expected", "must be", 1))
-    said = re.sub(r"`([^`]*)`", lambda found: " or ".join(WORDS.get(w, w) for w in found[1].split(" | ")), said)
+    said = re.sub(
+        r"^Expected `object` ", "must be a table ", said.replace("Expected", "must be", 1)
+    )
+    said = re.sub(
+        r"`([^`]*)`",
+        lambda found: " or ".join(WORDS.get(w, w) for w in found[1].split(" | ")),
+        said,
+    )
     return f"{place} {_line(said.replace(', got', ', not', 1))}"
 
 

@@ -1,4 +1,5 @@
-"""Where and how results are computed: versions, the cache of compiled programs, precision and threads of a fit."""
+"""Where and how results are computed: versions, the cache of compiled programs, precision and
+threads of a fit."""
 
 import contextlib
 import functools
@@ -11,22 +12,26 @@ from typing import Any
 
 import platformdirs
 
-# For the environment variable XLA_FLAGS: a loop of less than a megabyte becomes one piece of machine code. Else XLA splits
-# what is inside it among all cores, although these are busy with other seeds.
+# For the environment variable XLA_FLAGS: a loop of less than a megabyte becomes one piece of
+# machine code. Else XLA splits what is inside it among all cores, although these are busy with
+# other seeds.
 UNDIVIDED_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
 
 
 def keep_compiled_programs() -> Path | None:
     """Switch JAX's persistent compilation cache on; returns its folder.
 
-    `$JAX_COMPILATION_CACHE_DIR`, else the user's cache folder; a folder that cannot be written is done without (None), and
-    so is any with `$JAXMUSCLE_CACHE=off`.
+    `$JAX_COMPILATION_CACHE_DIR`, else the user's cache folder; a folder that cannot be written is
+    done without (None), and so is any with `$JAXMUSCLE_CACHE=off`.
     """
     import jax
 
     if _off():
         return _without(jax)
-    folder = Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_path("jaxmuscle") / "jax")
+    folder = Path(
+        os.environ.get("JAX_COMPILATION_CACHE_DIR")
+        or platformdirs.user_cache_path("jaxmuscle") / "jax"
+    )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -47,9 +52,11 @@ def _off() -> bool:
 
 
 def program_folder() -> Path | None:
-    """Where compiled programs are kept, None for nowhere; switches JAX's own cache on as well, unless it was set.
+    """Where compiled programs are kept, None for nowhere; switches JAX's own cache on as well,
+    unless it was set.
 
-    `$JAXMUSCLE_CACHE=off` switches both off; the folder is that of JAX's cache where one was set, else the user's.
+    `$JAXMUSCLE_CACHE=off` switches both off; the folder is that of JAX's cache where one was set,
+    else the user's.
     """
     import jax
 
@@ -70,7 +77,10 @@ def usable_cores() -> int:
 @functools.cache
 def versions() -> dict[str, str]:
     """Versions of what computed a result."""
-    return {name: version(name) for name in ("jaxmuscle", "jax", "diffrax", "optimistix", "equinox", "numpy")}
+    return {
+        name: version(name)
+        for name in ("jaxmuscle", "jax", "diffrax", "optimistix", "equinox", "numpy")
+    }
 
 
 class _OneThread:
@@ -95,7 +105,8 @@ class _OneThread:
 
 @functools.cache
 def _linear_algebra() -> Any:
-    """The libraries of NumPy and SciPy. To look for them takes a hundred times longer than to set their threads."""
+    """The libraries of NumPy and SciPy. To look for them takes a hundred times longer than to set
+    their threads."""
     import scipy.linalg  # noqa: F401  # brings a library of its own
     from threadpoolctl import ThreadpoolController
 
@@ -109,7 +120,8 @@ one_thread = _OneThread()
 def fitting() -> Iterator[None]:
     """Double precision in JAX, and one thread in NumPy's linear algebra.
 
-    The matrices of a fit are small. OpenBLAS's other threads would spin between them, a fifth of the processor time.
+    The matrices of a fit are small. OpenBLAS's other threads would spin between them, a fifth of
+    the processor time.
     """
     import jax
 

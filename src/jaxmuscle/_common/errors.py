@@ -18,14 +18,16 @@ class OperatingPointError(ValueError):
 
 
 class FirstOrderWarning(UserWarning):
-    """The perturbations of a task are so large that its simulation may give other numbers than the linear response.
+    """The perturbations of a task are so large that its simulation may give other numbers than the
+    linear response.
 
     See docs/model.md, *Where first order ends*.
     """
 
 
 class StoreError(ValueError):
-    """A store that is there already, cannot be resumed, or cannot be written; the message says what to do."""
+    """A store that is there already, cannot be resumed, or cannot be written; the message says what
+    to do."""
 
 
 class NotMixedError(RuntimeError):

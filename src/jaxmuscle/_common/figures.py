@@ -12,7 +12,11 @@ FORMATS = ("png", "pdf", "svg")
 DPI = 300  # of a PNG: what journals ask for
 # The same figure gives the same file, and its letters can be searched and changed.
 SETTINGS: Any = {"svg.hashsalt": "jaxmuscle", "pdf.fonttype": 42}
-UNDATED: dict[str, dict[str, Any]] = {"png": {}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
+UNDATED: dict[str, dict[str, Any]] = {
+    "png": {},
+    "pdf": {"CreationDate": None},
+    "svg": {"Date": None},
+}
 
 
 def pixels_of(figure: Any) -> bytes:
@@ -26,9 +30,15 @@ def pixels_of(figure: Any) -> bytes:
 
 
 def write_figure(
-    figure: Any, folder: Path, name: str, formats: Iterable[str] = FORMATS[:1], *, pixels: bytes | None = None
+    figure: Any,
+    folder: Path,
+    name: str,
+    formats: Iterable[str] = FORMATS[:1],
+    *,
+    pixels: bytes | None = None,
 ) -> list[str]:
-    """Writes `name` in each format, closes the figure, removes an earlier one in other formats; returns the files' names.
+    """Writes `name` in each format, closes the figure, removes an earlier one in other formats;
+    returns the files' names.
 
     `pixels`: its PNG, where it has been drawn already.
     """
@@ -38,7 +48,9 @@ def write_figure(
     wanted = list(dict.fromkeys(formats))
     unknown = [kind for kind in wanted if kind not in FORMATS]
     if unknown:
-        raise ValueError(f"formats: {unknown[0]!r} is no format of a figure: {choices(unknown[0], FORMATS)}")
+        raise ValueError(
+            f"formats: {unknown[0]!r} is no format of a figure: {choices(unknown[0], FORMATS)}"
+        )
     for kind in wanted:
         with replacing(folder / f"{name}.{kind}") as temporary, matplotlib.rc_context(SETTINGS):
             if kind == "png" and pixels is not None:

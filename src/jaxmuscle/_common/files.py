@@ -16,11 +16,13 @@ SYNCED_AT_ONCE = 32
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary path in the same folder that takes the place of `path` when the block ends without an exception."""
+    """A temporary path in the same folder that takes the place of `path` when the block ends
+    without an exception."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem[:40]}-{secrets.token_hex(6)}{path.suffix}")
-    temporary.touch(exist_ok=False)  # with the umask's mode; to ask for the umask means to set it, for all threads
+    # with the umask's mode; to ask for the umask means to set it, for all threads
+    temporary.touch(exist_ok=False)
     try:
         yield temporary
         os.replace(temporary, path)
@@ -29,13 +31,15 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def to_disk(paths: Iterable[Path]) -> None:
-    """Wait until files and the entries of folders are on disk, where a power cut leaves them; together, which is faster."""
+    """Wait until files and the entries of folders are on disk, where a power cut leaves them;
+    together, which is faster."""
     with ThreadPoolExecutor(SYNCED_AT_ONCE) as pool:
         list(pool.map(_to_disk, set(paths)))
 
 
 def _to_disk(path: Path) -> None:
-    if sys.platform == "win32" and path.is_dir():  # its entries need no waiting for, and cannot be waited for
+    # its entries need no waiting for, and cannot be waited for
+    if sys.platform == "win32" and path.is_dir():
         return
     handle = os.open(path, os.O_RDONLY if sys.platform != "win32" else os.O_RDWR)
     try:
@@ -52,7 +56,8 @@ def expanded(path: str | os.PathLike[str]) -> Path:
 
 
 def text_of(data: bytes, file: str, error: type[ValueError] = ValueError) -> str:
-    """The UTF-8 text of a file's bytes. Raises `error`, naming the file, where there is none or it is something else."""
+    """The UTF-8 text of a file's bytes. Raises `error`, naming the file, where there is none or it
+    is something else."""
     if not data.strip():
         raise error(f"{file}: is empty")
     try:
@@ -77,7 +82,8 @@ def remove(folder: Path, *names: str) -> None:
 
 
 def nulled(value: Any) -> Any:
-    """Nested tables and lists with None for every number that is not finite: JSON has no word for it."""
+    """Nested tables and lists with None for every number that is not finite: JSON has no word for
+    it."""
     if isinstance(value, dict):
         return {key: nulled(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

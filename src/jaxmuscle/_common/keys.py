@@ -1,4 +1,5 @@
-"""Random keys and seeds, checked; keys are made by programs that are kept: JAX's own would be compiled in every process."""
+"""Random keys and seeds, checked; keys are made by programs that are kept: JAX's own would be
+compiled in every process."""
 
 from typing import Any
 
@@ -13,7 +14,8 @@ SEEDS = 2**32  # how many there are
 
 
 def seed_of(seed: Any, name: str = "seed") -> int:
-    """A seed as a number. Raises `ValueError` naming the argument unless it is a whole number from 0 to 2³² - 1."""
+    """A seed as a number. Raises `ValueError` naming the argument unless it is a whole number from
+    0 to 2³² - 1."""
     whole = not isinstance(seed, bool | np.bool_) and isinstance(seed, int | np.integer)
     number = int(seed) if whole else -1
     if not 0 <= number < SEEDS:
@@ -22,27 +24,39 @@ def seed_of(seed: Any, name: str = "seed") -> int:
 
 
 def seeds_of(seeds: Any, name: str = "seeds") -> range | Int[np.ndarray, " seeds"]:
-    """So many seeds from 0, or those given. Raises `ValueError` unless each is whole, in range and there once."""
+    """So many seeds from 0, or those given. Raises `ValueError` unless each is whole, in range and
+    there once."""
     try:
         single = np.ndim(seeds) == 0
     except ValueError:  # lists of several lengths
-        raise ValueError(f"{name} = {seeds!r}: give a number of seeds, or whole numbers in a list") from None
+        raise ValueError(
+            f"{name} = {seeds!r}: give a number of seeds, or whole numbers in a list"
+        ) from None
     if single:
         if isinstance(seeds, int | np.integer) and seeds < 1:
             raise ValueError(f"{name} = {seeds!r}: give at least one seed")
         return range(seed_of(seeds, name))
     numbers = seeds if isinstance(seeds, range) else np.asarray(seeds)
-    if isinstance(numbers, np.ndarray) and (numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer)):
-        raise ValueError(f"{name}: {numbers.dtype} of shape {numbers.shape}; give a number of seeds, or whole numbers in a "
-                         "list")  # fmt: skip
+    if isinstance(numbers, np.ndarray) and (
+        numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer)
+    ):
+        raise ValueError(
+            f"{name}: {numbers.dtype} of shape {numbers.shape}; give a number of seeds, or whole"
+            " numbers in a list"
+        )
     if len(numbers) == 0:
         raise ValueError(f"{name} is empty: give at least one seed")
     if min(numbers) < 0 or max(numbers) >= SEEDS:
         wrong = next(int(number) for number in numbers if not 0 <= number < SEEDS)
-        raise ValueError(f"{name} holds {wrong}: seeds are whole numbers from 0 to 2^32 - 1 = {SEEDS - 1}")
+        raise ValueError(
+            f"{name} holds {wrong}: seeds are whole numbers from 0 to 2^32 - 1 = {SEEDS - 1}"
+        )
     if isinstance(numbers, np.ndarray) and len(np.unique(numbers)) < len(numbers):
         values, counts = np.unique(numbers, return_counts=True)
-        raise ValueError(f"{name} holds {values[counts > 1][0]} more than once: every seed is one noise path, give it once")
+        raise ValueError(
+            f"{name} holds {values[counts > 1][0]} more than once: every seed is one noise path,"
+            " give it once"
+        )
     return numbers if isinstance(numbers, range) else numbers.astype(np.int64)
 
 
@@ -52,10 +66,13 @@ def number_of(key: Any) -> int | None:
 
 
 def check_key(key: Any) -> None:
-    """Raise a `ValueError` unless it is a seed number, a key of `jax.random.key`, or the words of `jax.random.PRNGKey`."""
+    """Raise a `ValueError` unless it is a seed number, a key of `jax.random.key`, or the words of
+    `jax.random.PRNGKey`."""
     if _is_typed(key):
         if key.shape:
-            raise ValueError(f"key has shape {key.shape}: give one key, as jax.random.split(key)[0]")
+            raise ValueError(
+                f"key has shape {key.shape}: give one key, as jax.random.split(key)[0]"
+            )
     elif not _is_words(key) and not (isinstance(key, Tracer) and _is_whole(key)):
         try:
             seed_of(int(key) if _is_whole(key) else key, "key")
@@ -83,7 +100,11 @@ def _is_words(key: Any) -> bool:
 
 def _is_whole(key: Any) -> bool:
     """Whether it is an array of one whole number."""
-    return isinstance(key, jax.Array | np.ndarray) and key.shape == () and np.issubdtype(key.dtype, np.integer)
+    return (
+        isinstance(key, jax.Array | np.ndarray)
+        and key.shape == ()
+        and np.issubdtype(key.dtype, np.integer)
+    )
 
 
 def fold_in(key: PRNGKeyArray, number: int) -> PRNGKeyArray:

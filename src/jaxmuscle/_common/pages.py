@@ -1,4 +1,5 @@
-"""Pages of HTML for results: one file each, which asks the network for nothing and in which every text is escaped."""
+"""Pages of HTML for results: one file each, which asks the network for nothing and in which every
+text is escaped."""
 
 import base64
 import io
@@ -14,7 +15,8 @@ Html = NewType("Html", str)  # escaped already
 
 # What stands in a page is all that it may load.
 ALONE = (
-    "<meta http-equiv='Content-Security-Policy' content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">"
+    "<meta http-equiv='Content-Security-Policy' content=\"default-src 'none'; img-src data:;"
+    " style-src 'unsafe-inline'\">"
 )
 STYLE = """
 :root{color-scheme:light dark;--page:#fff;--ink:#1a1a1a;--soft:#555;--line:#ddd;--strong:#555;--box:#f4f4f4;--link:#0058a3;
@@ -39,11 +41,12 @@ table.stack td:empty{display:none}table.stack td::before{content:attr(data-label
 color:var(--soft)}table.stack td:first-child{font-weight:600}table.stack td:first-child::before{display:none}}
 @media print{body{max-width:none;padding:0;font-size:10pt}h2{break-after:avoid}tr,figure,pre{break-inside:avoid}
 figure img{max-height:22cm;width:auto}a{color:inherit}@page{margin:16mm}}
-""".strip()
+""".strip()  # noqa: E501 (rules of one selector stand on one line)
 
 
 def document(title: str, body: Iterable[str], *, style: str = "", head: str = "") -> str:
-    """A whole page; `style`, rules of its own after those of all pages, `head`, what else stands in its head."""
+    """A whole page; `style`, rules of its own after those of all pages, `head`, what else stands in
+    its head."""
     return (
         f"<!doctype html>\n<html lang='en'>\n<head>\n<meta charset='utf-8'>\n{head}"
         "<meta name='viewport' content='width=device-width, initial-scale=1'>\n"
@@ -56,7 +59,8 @@ def document(title: str, body: Iterable[str], *, style: str = "", head: str = ""
 def write_page(path: Path, title: str, body: Iterable[Html]) -> None:
     """Write a page with its title as heading, whole or not at all."""
     text = document(title, [heading(title, 1), *body], head=f"{ALONE}\n")
-    write_text(path, text.encode("utf-8", "replace").decode())  # half characters out of a file cannot be written
+    # half characters out of a file cannot be written
+    write_text(path, text.encode("utf-8", "replace").decode())
 
 
 def heading(text: str, level: int = 2) -> Html:
@@ -65,7 +69,9 @@ def heading(text: str, level: int = 2) -> Html:
 
 def paragraph(text: str, kind: str = "") -> Html:
     """A paragraph of a kind that the style knows."""
-    return Html(f"<p class='{escape(kind)}'>{escape(text)}</p>" if kind else f"<p>{escape(text)}</p>")
+    return Html(
+        f"<p class='{escape(kind)}'>{escape(text)}</p>" if kind else f"<p>{escape(text)}</p>"
+    )
 
 
 def items(texts: Iterable[str]) -> Html:
@@ -75,7 +81,9 @@ def items(texts: Iterable[str]) -> Html:
 
 def _with_code(text: str) -> str:
     parts = text.split("`")
-    return "".join(f"<code>{escape(part)}</code>" if i % 2 else escape(part) for i, part in enumerate(parts))
+    return "".join(
+        f"<code>{escape(part)}</code>" if i % 2 else escape(part) for i, part in enumerate(parts)
+    )
 
 
 def code(text: str) -> Html:
@@ -83,18 +91,24 @@ def code(text: str) -> Html:
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
-    """A table, without columns that hold nothing; on a narrow screen each row becomes a block with the columns' names."""
+    """A table, without columns that hold nothing; on a narrow screen each row becomes a block with
+    the columns' names."""
     rows = list(rows)
     held = [i for i in range(len(columns)) if any(row[i] for row in rows)]
     columns, rows = [columns[i] for i in held], [[row[i] for i in held] for row in rows]
     head = "".join(f"<th scope='col'>{escape(column)}</th>" for column in columns)
     body = (
         "<tr>"
-        + "".join(f"<td data-label='{escape(c)}'>{escape(cell)}</td>" for c, cell in zip(columns, row, strict=True))
+        + "".join(
+            f"<td data-label='{escape(c)}'>{escape(cell)}</td>"
+            for c, cell in zip(columns, row, strict=True)
+        )
         + "</tr>"
         for row in rows
     )
-    whole = f"<table class='stack'><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+    whole = (
+        f"<table class='stack'><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+    )
     return Html(f"<div class='scroll'>{whole}</div>")
 
 
@@ -112,19 +126,26 @@ def _in_words(value: Any) -> str:
         case float():
             return f"{value:.6g}"
         case Mapping():
-            return ", ".join(f"{name} = {_in_words(each)}" for name, each in value.items()) or "none"
+            return (
+                ", ".join(f"{name} = {_in_words(each)}" for name, each in value.items()) or "none"
+            )
         case list() | tuple():
             return ", ".join(map(_in_words, value)) or "none"
     return str(value)
 
 
 def picture(figure: Any, words: str, *, pixels: bytes | None = None) -> Html:
-    """A figure that stands in the page, with words below: as SVG, or its PNG where it has too many lines for that."""
+    """A figure that stands in the page, with words below: as SVG, or its PNG where it has too many
+    lines for that."""
     mime, made = ("image/svg+xml", _drawn(figure)) if pixels is None else ("image/png", pixels)
     data = base64.b64encode(made).decode()
     said = escape(words)
-    size = f"width='{round(96 * figure.get_figwidth() * 1.25)}'"  # letters of 8 points are read as those of the text
-    return Html(f"<figure><img {size} alt='{said}' src='data:{mime};base64,{data}'><figcaption>{said}</figcaption></figure>")
+    # letters of 8 points are read as those of the text
+    size = f"width='{round(96 * figure.get_figwidth() * 1.25)}'"
+    return Html(
+        f"<figure><img {size} alt='{said}'"
+        f" src='data:{mime};base64,{data}'><figcaption>{said}</figcaption></figure>"
+    )
 
 
 def _drawn(figure: Any) -> bytes:
@@ -133,5 +154,6 @@ def _drawn(figure: Any) -> bytes:
     made = io.BytesIO()
     with matplotlib.rc_context(SETTINGS):
         figure.savefig(made, format="svg", metadata=UNDATED["svg"])
-    figure.set_layout_engine("none")  # it stays as it is now: to lay it out again for its own file takes as long as drawing
+    # it stays as it is now: to lay it out again for its own file takes as long as drawing
+    figure.set_layout_engine("none")
     return made.getvalue()

@@ -1,4 +1,5 @@
-"""Compiled programs that outlive the process: traced and compiled once, then loaded from the user's cache folder."""
+"""Compiled programs that outlive the process: traced and compiled once, then loaded from the user's
+cache folder."""
 
 import contextlib
 import functools
@@ -26,13 +27,33 @@ from .files import replacing
 
 P = ParamSpec("P")
 R = TypeVar("R")
-# What a program may be made of: code whose version is part of the key. Another's class may change without a sign.
-OTHERS = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "scipy", "blackjax")
+# What a program may be made of: code whose version is part of the key. Another's class may change
+# without a sign.
+OTHERS = (
+    "jax",
+    "jaxlib",
+    "numpy",
+    "equinox",
+    "diffrax",
+    "optimistix",
+    "lineax",
+    "jaxtyping",
+    "scipy",
+    "blackjax",
+)
 KNOWN = ("jaxmuscle", "builtins", "collections", *OTHERS)
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")
-CONFIG = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_default_prng_impl",
-          "jax_threefry_partitionable", "jax_debug_nans", "jax_disable_most_optimizations")  # fmt: skip
-# XLA's older way to make code of loops: compiled in half the time, loaded in three quarters, and run as fast.
+CONFIG = (
+    "jax_enable_x64",
+    "jax_numpy_dtype_promotion",
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+    "jax_debug_nans",
+    "jax_disable_most_optimizations",
+)
+# XLA's older way to make code of loops: compiled in half the time, loaded in three quarters, and
+# run as fast.
 OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 HIT = "/jax/compilation_cache/cache_hits"
 UNUSED = 60 * 86400.0  # seconds
@@ -54,7 +75,9 @@ class _Program(NamedTuple):
 
     def __call__(self, arrays: list[Any]) -> Any:
         found = self.call(*arrays)
-        return jax.tree.map(lambda x: found[x.number] if isinstance(x, _Slot) else x, self.shape, is_leaf=_is_slot)
+        return jax.tree.map(
+            lambda x: found[x.number] if isinstance(x, _Slot) else x, self.shape, is_leaf=_is_slot
+        )
 
 
 def _is_slot(leaf: Any) -> bool:
@@ -66,11 +89,13 @@ MOST = 48  # programs of one function in memory; those that have to go come back
 
 
 class Kept:
-    """A function that is compiled for the arrays among its arguments (trees), the rest fixed, and kept between processes.
+    """A function that is compiled for the arrays among its arguments (trees), the rest fixed, and
+    kept between processes.
 
-    As `eqx.filter_jit`; a program is loaded if its code, its versions, the machine and the structure of its arguments are
-    the same. Anything that stands against it (an own class among the arguments, no folder, a damaged file) means that it
-    is traced and compiled as usual. `JAXMUSCLE_CACHE=off` switches keeping off.
+    As `eqx.filter_jit`; a program is loaded if its code, its versions, the machine and the
+    structure of its arguments are the same. Anything that stands against it (an own class among the
+    arguments, no folder, a damaged file) means that it is traced and compiled as usual.
+    `JAXMUSCLE_CACHE=off` switches keeping off.
     """
 
     def __init__(self, function: Callable[..., Any], options: Mapping[str, Any] | None = None):
@@ -94,19 +119,38 @@ class Kept:
             return self.jitted(*args, **kwargs)
         fixed = tuple(leaf for leaf, own in zip(leaves, which, strict=True) if not own)
         # With their types: 1, 1.0 and True are equal, and not the same program.
-        signature = (structure, which, tuple((type(x), x) for x in fixed), tuple(map(_kind, arrays)), _config())
+        signature = (
+            structure,
+            which,
+            tuple((type(x), x) for x in fixed),
+            tuple(map(_kind, arrays)),
+            _config(),
+        )
         program = self.programs.get(signature)
         if program is None:
             # Every program takes memory maps, of which Linux allows a process 65530.
             for oldest in list(self.programs)[: max(0, len(self.programs) + 1 - MOST)]:
                 self.programs.pop(oldest, None)
-            program = self.programs[signature] = self._made(structure, which, fixed, arrays, signature)
+            program = self.programs[signature] = self._made(
+                structure, which, fixed, arrays, signature
+            )
         return program(arrays)
 
-    def _made(self, structure: Any, which: tuple[bool, ...], fixed: tuple, arrays: list[Any], signature: Any) -> _Program:
+    def _made(
+        self,
+        structure: Any,
+        which: tuple[bool, ...],
+        fixed: tuple,
+        arrays: list[Any],
+        signature: Any,
+    ) -> _Program:
         """From the folder, or traced, compiled and put there."""
         folder = program_folder()
-        place = None if folder is None or len(jax.devices()) > 1 else _place(folder, self.function, signature)
+        place = (
+            None
+            if folder is None or len(jax.devices()) > 1
+            else _place(folder, self.function, signature)
+        )
         if place is not None and (entry := _read(place)) is not None:
             compiled = _load(place.parent.parent / entry[0])
             if compiled is not None:
@@ -116,14 +160,22 @@ class Kept:
         def flat(*arrays: Any) -> tuple[Any, ...]:
             self.traces += 1
             some, rest = iter(arrays), iter(fixed)
-            args, kwargs = jax.tree.unflatten(structure, [next(some if own else rest) for own in which])
+            args, kwargs = jax.tree.unflatten(
+                structure, [next(some if own else rest) for own in which]
+            )
             leaves, tree = jax.tree.flatten(self.function(*args, **kwargs))
             number = iter(range(len(leaves)))
-            shape[:] = [jax.tree.unflatten(tree, [_Slot(next(number)) if _is_array(x) else x for x in leaves])]
+            shape[:] = [
+                jax.tree.unflatten(
+                    tree, [_Slot(next(number)) if _is_array(x) else x for x in leaves]
+                )
+            ]
             return tuple(x for x in leaves if _is_array(x))
 
         # A name that JAX's own cache does not know, see `_compiled`.
-        flat.__name__ = ("" if place is None else "kept_") + getattr(self.function, "__name__", "program")
+        flat.__name__ = ("" if place is None else "kept_") + getattr(
+            self.function, "__name__", "program"
+        )
         # Unused arguments stay: programs that say the same take the same arguments.
         lowered = jax.jit(flat, keep_unused=True).lower(*arrays)
         if place is None:
@@ -132,7 +184,8 @@ class Kept:
 
 
 def _machine_code(lowered: Any, options: Mapping[str, Any]) -> Any:
-    """A lowered program, compiled with options; without them by a version of XLA that does not know them."""
+    """A lowered program, compiled with options; without them by a version of XLA that does not know
+    them."""
     try:
         return lowered.compile(dict(options))
     except jax.errors.JaxRuntimeError as error:
@@ -142,7 +195,8 @@ def _machine_code(lowered: Any, options: Mapping[str, Any]) -> Any:
 
 
 def _compiled(lowered: Any, options: Mapping[str, Any], place: Path, shape: Any) -> Any:
-    """A lowered program, compiled or from the folder if code that was changed gives the same one; put there."""
+    """A lowered program, compiled or from the folder if code that was changed gives the same one;
+    put there."""
     key = (lowered.as_text(), _versions(), _machine(), os.environ.get("XLA_FLAGS", ""), options)
     name = hashlib.sha256(repr(key).encode()).hexdigest()
     folder = place.parent.parent
@@ -164,7 +218,8 @@ def _compiled(lowered: Any, options: Mapping[str, Any], place: Path, shape: Any)
 
 @contextlib.contextmanager
 def _beside_jax() -> Iterator[None]:
-    """JAX's own cache writes nothing: one copy of a program is enough. One thread at a time, since it sets an option."""
+    """JAX's own cache writes nothing: one copy of a program is enough. One thread at a time, since
+    it sets an option."""
     with LOCK:
         least = jax.config.jax_persistent_cache_min_compile_time_secs  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1e9)
@@ -178,7 +233,9 @@ def _beside_jax() -> Iterator[None]:
 def _hits() -> list[str]:
     """What JAX's cache of compiled programs has given back, one entry each."""
     found: list[str] = []
-    jax.monitoring.register_event_listener(lambda event, **_: found.append(event) if event == HIT else None)
+    jax.monitoring.register_event_listener(
+        lambda event, **_: found.append(event) if event == HIT else None
+    )
     return found
 
 
@@ -188,7 +245,8 @@ def kept(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def kept_to_run_long(function: Callable[P, R]) -> Callable[P, R]:
-    """As `kept`, for a program that runs longer than it compiles: XLA's newer emitters make it a tenth faster."""
+    """As `kept`, for a program that runs longer than it compiles: XLA's newer emitters make it a
+    tenth faster."""
     return Kept(function, {})
 
 
@@ -217,7 +275,14 @@ def _place(folder: Path, function: Any, signature: Any) -> Path | None:
     rest = repr((which, fixed, kinds, config))
     if told is None or ADDRESS.search(rest) or not all(_known(kind) for kind, _ in fixed):
         return None
-    key = (function.__module__, function.__qualname__, told, rest, _machine(), os.environ.get("XLA_FLAGS", ""))
+    key = (
+        function.__module__,
+        function.__qualname__,
+        told,
+        rest,
+        _machine(),
+        os.environ.get("XLA_FLAGS", ""),
+    )
     return folder / _code()[:16] / hashlib.sha256(repr(key).encode()).hexdigest()
 
 
@@ -239,7 +304,8 @@ def _told(structure: Any) -> str | None:
 
 
 def _text(data: Any) -> str | None:
-    """As `repr`; but that of a module leaves out what *is* its default, which the same number read from a file is not."""
+    """As `repr`; but that of a module leaves out what *is* its default, which the same number read
+    from a file is not."""
     if isinstance(data, eqx.Module):
         leaves, structure = jax.tree.flatten(data)
         told = _told(structure)
@@ -277,7 +343,11 @@ def _machine() -> str:
     """What machine code depends on."""
     device = jax.devices()[0]
     try:
-        flags = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags"))
+        flags = next(
+            line
+            for line in Path("/proc/cpuinfo").read_text().splitlines()
+            if line.startswith("flags")
+        )
     except (OSError, StopIteration):
         flags = platform.processor()
     return repr((platform.system(), platform.machine(), device.platform, device.device_kind, flags))
@@ -301,7 +371,8 @@ def _write(place: Path, content: Callable[[], Any]) -> None:
 
 
 def _tidied(folder: Path) -> None:
-    """Remove what nobody has used for two months from the folder of programs, before new code adds its own."""
+    """Remove what nobody has used for two months from the folder of programs, before new code adds
+    its own."""
     now = time.time()
     for path in folder.rglob("*") if folder.exists() else ():
         with contextlib.suppress(OSError):
@@ -327,7 +398,8 @@ def _read(place: Path) -> Any:
 def _prepare() -> None:
     """Make JAX's linear algebra ready to be called.
 
-    jaxlib finds LAPACK when it lowers the first program that needs it; one that is loaded would call into nothing.
+    jaxlib finds LAPACK when it lowers the first program that needs it; one that is loaded would
+    call into nothing.
     """
     jax.jit(jax.lax.linalg.lu).lower(np.eye(1))
 

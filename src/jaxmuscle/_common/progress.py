@@ -1,4 +1,5 @@
-"""Progress of long work: a bar on a terminal and in a notebook, else a line every ten seconds through `logging`."""
+"""Progress of long work: a bar on a terminal and in a notebook, else a line every ten seconds
+through `logging`."""
 
 import contextlib
 import logging
@@ -22,10 +23,12 @@ def nothing(text: str, share: float) -> None:
 
 @contextlib.contextmanager
 def told(progress: bool | Tell, title: str) -> Iterator[Tell]:
-    """What a function calls with (text, share): the one that was given, nothing for False, for True what shows it.
+    """What a function calls with (text, share): the one that was given, nothing for False, for True
+    what shows it.
 
-    The bar of rich on a terminal and in a notebook; otherwise lines, also while nothing is told (a program compiles). The
-    share never falls: work that turns out to be more than expected makes it wait.
+    The bar of rich on a terminal and in a notebook; otherwise lines, also while nothing is told (a
+    program compiles). The share never falls: work that turns out to be more than expected makes it
+    wait.
     """
     if callable(progress):
         yield _rising(progress)
@@ -54,7 +57,12 @@ def _rising(tell: Tell) -> Tell:
 def _bar(title: str, screen: "Console") -> Iterator[Tell]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.fields[title]}"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.fields[title]}"),
+        BarColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=screen, transient=True) as bar:
         row = bar.add_task("starting", total=1.0, title=title)
         yield lambda text, share: bar.update(row, description=text, completed=share)
@@ -89,7 +97,8 @@ def _quiet() -> bool:
 
 
 def _say(line: str) -> None:
-    """Through the logger `jaxmuscle`; where that would be lost, to the standard error, since it was asked for."""
+    """Through the logger `jaxmuscle`; where that would be lost, to the standard error, since it was
+    asked for."""
     if LOG.hasHandlers() and LOG.isEnabledFor(logging.INFO):
         LOG.info(line)
     else:

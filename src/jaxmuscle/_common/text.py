@@ -10,7 +10,8 @@ WIDTH = 80
 
 
 def folded(lines: Iterable[str]) -> str:
-    """The lines as one text; what is longer than 80 columns goes on below, two columns further in."""
+    """The lines as one text; what is longer than 80 columns goes on below, two columns further
+    in."""
     return "\n".join(part for line in lines for part in _parts(line))
 
 
@@ -18,11 +19,14 @@ def _parts(line: str) -> list[str]:
     if len(line) <= WIDTH:
         return [line]
     indent = " " * (len(line) - len(line.lstrip()) + 2)
-    return textwrap.wrap(line, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return textwrap.wrap(
+        line, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
 
 
 def rounded(value: float, error: float) -> tuple[str, str]:
-    """A value and its error as they are printed: the error to two digits, the value to as many places."""
+    """A value and its error as they are printed: the error to two digits, the value to as many
+    places."""
     if not (np.isfinite(value) and np.isfinite(error) and error > 0):
         return f"{value:.3g}", f"{error:.2g}"
     places = 1 - int(np.floor(np.log10(error)))
@@ -40,7 +44,8 @@ def squared(unit: str) -> str:
 
 
 def probability(p: float) -> str:
-    """In words, as in "p = 0.23"; "p <= 0.001" for what is the least that 999 replicates can show."""
+    """In words, as in "p = 0.23"; "p <= 0.001" for what is the least that 999 replicates can
+    show."""
     return "p <= 0.001" if p <= 0.001 else f"p = {p:.2g}"
 
 
@@ -49,14 +54,23 @@ def choices(word: object, options: Iterable[str]) -> str:
     options = list(options)
     plain = {option.lower(): option for option in options}
     near = difflib.get_close_matches(str(word).lower(), plain, n=1, cutoff=0.4)
-    return f"did you mean {plain[near[0]]!r}? Known: {', '.join(options)}" if near else f"known are {', '.join(options)}"
+    return (
+        f"did you mean {plain[near[0]]!r}? Known: {', '.join(options)}"
+        if near
+        else f"known are {', '.join(options)}"
+    )
 
 
 def listed(items: Sequence | np.ndarray) -> str:
     """The first ten of some numbers or names."""
-    return ", ".join(str(item) for item in items[:10]) + (f" and {len(items) - 10} more" if len(items) > 10 else "")
+    return ", ".join(str(item) for item in items[:10]) + (
+        f" and {len(items) - 10} more" if len(items) > 10 else ""
+    )
 
 
 def printable(text: str) -> str:
-    """Text out of a file without letters that would do something to a terminal or cannot be written."""
-    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+    """Text out of a file without letters that would do something to a terminal or cannot be
+    written."""
+    return "".join(
+        letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text
+    )

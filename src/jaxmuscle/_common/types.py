@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 if TYPE_CHECKING:
-    Scalar = Any  # a union of numbers and arrays supports no arithmetic in the eyes of a type checker
+    # a union of numbers and arrays supports no arithmetic in the eyes of a type checker
+    Scalar = Any
     Key = PRNGKeyArray | Array | np.ndarray | np.integer | int
     Seed = Array | np.integer | int
     Seeds = int | np.integer | Sequence[int] | np.ndarray

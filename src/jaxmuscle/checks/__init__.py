@@ -1,4 +1,5 @@
-"""Does the model describe the data? Simulated checks of goodness, and refits of simulated data (bootstrap).
+"""Does the model describe the data? Simulated checks of goodness, and refits of simulated data
+(bootstrap).
 
 Takes a fit, and fits replicates of it.
 """

@@ -23,7 +23,10 @@ from ._replicates import Made, replicates_of, with_data
 STARTS = 32
 TOGETHER = 50
 SIMULATED = "recordings simulated nonlinearly"
-DRAWN = "spectra drawn from the Gaussian law of their sigma, not simulated: the target states no segments"
+DRAWN = (
+    "spectra drawn from the Gaussian law of their sigma, not simulated: the target states no"
+    " segments"
+)
 
 
 def bootstrap(
@@ -33,18 +36,21 @@ def bootstrap(
     key: Key = 0,
     progress: bool | Callable[[str, float], None] = False,
 ) -> Bootstrap:
-    """Whether the standard errors of a fit hold: data are made from the fitted task and fitted again.
+    """Whether the standard errors of a fit hold: data are made from the fitted task and fitted
+    again.
 
         result = jm.fit(jm.task_for(target), target)
         print(jm.bootstrap(result))
 
-    For every replicate the nonlinear simulator gives one recording for each trial, as long as its Welch segments ask for,
-    analysed as the target's (a target with sigma alone: spectra drawn from the Gaussian law in the log about the fit). It
-    is fitted as `result` was, with its free parameters, priors and bounds, and with a coefficient of variation, a mean
-    force and a dynamic stiffness made for this replicate where the fit used them, from 32 starts in linear response (no
-    nonlinear correction: where `result.check` shows a nonlinear response, the bias contains it). For each quantity that the
-    fit determines: spread of the refits over the stated standard error, bias, and how many of the refits' own 95 %
-    intervals (±1.96 errors) hold the value that was simulated.
+    For every replicate the nonlinear simulator gives one recording for each trial, as long as its
+    Welch segments ask for, analysed as the target's (a target with sigma alone: spectra drawn from
+    the Gaussian law in the log about the fit). It is fitted as `result` was, with its free
+    parameters, priors and bounds, and with a coefficient of variation, a mean force and a dynamic
+    stiffness made for this replicate where the fit used them, from 32 starts in linear response (no
+    nonlinear correction: where `result.check` shows a nonlinear response, the bias contains it).
+    For each quantity that the fit determines: spread of the refits over the stated standard error,
+    bias, and how many of the refits' own 95 % intervals (±1.96 errors) hold the value that was
+    simulated.
 
     **Arguments:**
 
@@ -53,10 +59,11 @@ def bootstrap(
     - `key`: a `jax.random` key or a seed number
     - `progress`: True or a function of (text, share)
 
-    **Returns:** a `Bootstrap`; replicates that could not be simulated or fitted are in `failed`, with the reason.
+    **Returns:** a `Bootstrap`; replicates that could not be simulated or fitted are in `failed`,
+    with the reason.
 
-    **Raises:** `ValueError` for a target without segments and sigma, a failed fit, a task without linear response, a fit
-    that determines nothing, fewer than 2 replicates.
+    **Raises:** `ValueError` for a target without segments and sigma, a failed fit, a task without
+    linear response, a fit that determines nothing, fewer than 2 replicates.
     """
     if replicates < 2:
         raise ValueError(f"replicates = {replicates} must be at least 2: one refit has no spread")
@@ -64,48 +71,77 @@ def bootstrap(
         require_spread(target)
     stated = result.determined
     if not stated:
-        raise ValueError(f"{result.title}: the fit determines no quantity, so there is no stated error to check")
+        raise ValueError(
+            f"{result.title}: the fit determines no quantity, so there is no stated error to check"
+        )
     with told(progress, f"bootstrap of {result.title}") as tell, fitting():
         problem = reopened(result, key=key)
         tell("making data", 0.0)
         made, failed = replicates_of(problem, tuple(result.tasks.values()), replicates)
         fits, more = _fitted(problem, result, made, tell)
         true = _true(problem, result)
-    found = {name: Recovery(name, e.unit, true[name], float(e.stderr), *_read(fits, name)) for name, e in stated.items()
-             if e.stderr is not None} if len(fits) > 1 else {}  # fmt: skip
-    laws = {SIMULATED if target.segments is not None else DRAWN for target in result.targets.values()}
-    return Bootstrap(result.title, result.tasks, found, replicates, dict(sorted((failed | more).items())),
-                     "; ".join(sorted(laws, reverse=True)), number_of(key))  # fmt: skip
+    found = (
+        {
+            name: Recovery(name, e.unit, true[name], float(e.stderr), *_read(fits, name))
+            for name, e in stated.items()
+            if e.stderr is not None
+        }
+        if len(fits) > 1
+        else {}
+    )
+    laws = {
+        SIMULATED if target.segments is not None else DRAWN for target in result.targets.values()
+    }
+    return Bootstrap(
+        result.title,
+        result.tasks,
+        found,
+        replicates,
+        dict(sorted((failed | more).items())),
+        "; ".join(sorted(laws, reverse=True)),
+        number_of(key),
+    )
 
 
 def _read(fits: list[FitResult], name: str) -> tuple[np.ndarray, np.ndarray]:
     estimates = [fit.derived.get(name) or fit.parameters[name] for fit in fits]
-    return (np.array([e.value for e in estimates], dtype=float),
-            np.array([np.nan if e.stderr is None else e.stderr for e in estimates], dtype=float))  # fmt: skip
+    return (
+        np.array([e.value for e in estimates], dtype=float),
+        np.array([np.nan if e.stderr is None else e.stderr for e in estimates], dtype=float),
+    )
 
 
 def _true(problem: FitProblem, result: FitResult) -> dict[str, float]:
     """Values of the fitted tasks in linear response."""
     objective = problem.linear()
-    values = quantities(objective, expand(objective, problem.theta_of(tuple(result.tasks.values()))[None]))[0]
+    values = quantities(
+        objective, expand(objective, problem.theta_of(tuple(result.tasks.values()))[None])
+    )[0]
     places = {name: problem.where(name) for name in result.derived_names}
     derived = {name: float(values[i][base][0]) for name, (i, base) in places.items()}
     return {name: p.value for name, p in result.parameters.items()} | derived
 
 
-def _fitted(problem: FitProblem, result: FitResult, made: Made, tell: Callable[[str, float], None]) -> Any:
+def _fitted(
+    problem: FitProblem, result: FitResult, made: Made, tell: Callable[[str, float], None]
+) -> Any:
     """Refits that succeeded, and why others did not."""
     fits: list[FitResult] = []
     failed: dict[int, str] = {}
     numbers = list(made)
-    settings = result.settings | {"starts": STARTS} | settings_of(problem, result.settings["bounds"])
+    settings = (
+        result.settings | {"starts": STARTS} | settings_of(problem, result.settings["bounds"])
+    )
     for start in range(0, len(numbers), TOGETHER):
         part = numbers[start : start + TOGETHER]
 
         def show(text: str, share: float, before: int = start, size: int = len(part)) -> None:
             tell(text, 0.1 + 0.9 * (before + share * size) / len(numbers))
 
-        plans = [Plan(with_data(problem, made[n]), STARTS, settings["max_steps"], 0, settings, None) for n in part]
+        plans = [
+            Plan(with_data(problem, made[n]), STARTS, settings["max_steps"], 0, settings, None)
+            for n in part
+        ]
         for number, fit in zip(part, search_together(plans, show, replicates=True), strict=True):
             if fit.success:
                 fits.append(fit)

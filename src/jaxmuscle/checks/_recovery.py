@@ -1,4 +1,5 @@
-"""What a bootstrap found: how far refits scatter about the truth, against the errors that were stated."""
+"""What a bootstrap found: how far refits scatter about the truth, against the errors that were
+stated."""
 
 import json
 import math
@@ -32,8 +33,9 @@ DOUBT = 0.01
 
 
 class Recovery(eqx.Module):
-    """One quantity: the value `true` simulated from, the standard error `stated` by the fit, `values` that refits found with
-    the errors `stderrs` they state (NaN where a refit states none)."""
+    """One quantity: the value `true` simulated from, the standard error `stated` by the fit,
+    `values` that refits found with the errors `stderrs` they state (NaN where a refit states
+    none)."""
 
     name: str
     unit: str
@@ -59,7 +61,8 @@ class Recovery(eqx.Module):
 
     @property
     def core(self) -> float:
-        """Half the width of the middle 68.3 % of the refits over the stated error: the ratio without its tails."""
+        """Half the width of the middle 68.3 % of the refits over the stated error: the ratio
+        without its tails."""
         low, high = np.quantile(self.values, scipy.stats.norm.cdf([-1.0, 1.0]))
         return float(high - low) / 2 / self.stated
 
@@ -88,13 +91,15 @@ class Recovery(eqx.Module):
 
     @property
     def places(self) -> Float[np.ndarray, " intervals"]:
-        """Where the true value lies in each refit's own normal law: its probability below the value that was simulated."""
+        """Where the true value lies in each refit's own normal law: its probability below the value
+        that was simulated."""
         known = np.isfinite(self.stderrs) & (self.stderrs > 0)
         return scipy.stats.norm.cdf((self.true - self.values[known]) / self.stderrs[known])
 
     @property
     def verdict(self) -> str:
-        """Whether the error holds, judged at 1 % by the χ² law of the spread and the binomial one of the coverage."""
+        """Whether the error holds, judged at 1 % by the χ² law of the spread and the binomial one
+        of the coverage."""
         squares = (len(self.values) - 1) * self.ratio**2
         above = scipy.stats.chi2.sf(squares, len(self.values) - 1)
         near, known = self.inside
@@ -111,10 +116,11 @@ class Recovery(eqx.Module):
 class Bootstrap(Printed, Result, eqx.Module):
     """What refits of data made from a fit found.
 
-    `quantities` {name: `Recovery`}, those that the fit determines: of each the value `true` simulated from, the standard
-    error `stated` by the fit, the `values` that refits found and the errors `stderrs` that these state; `replicates` asked
-    for; `failed` {replicate: why it was not simulated or fitted}; `source`, how the data were made; `tasks` {target: the
-    fitted task from which its data were made}; `target`, name of what was fitted; `seed`; `versions`.
+    `quantities` {name: `Recovery`}, those that the fit determines: of each the value `true`
+    simulated from, the standard error `stated` by the fit, the `values` that refits found and the
+    errors `stderrs` that these state; `replicates` asked for; `failed` {replicate: why it was not
+    simulated or fitted}; `source`, how the data were made; `tasks` {target: the fitted task from
+    which its data were made}; `target`, name of what was fitted; `seed`; `versions`.
     """
 
     target: str
@@ -129,16 +135,33 @@ class Bootstrap(Printed, Result, eqx.Module):
     @property
     def success(self) -> bool:
         """Whether every replicate was fitted and every stated error holds."""
-        return not self.failed and bool(self.quantities) and all(q.verdict == "holds" for q in self.quantities.values())
+        return (
+            not self.failed
+            and bool(self.quantities)
+            and all(q.verdict == "holds" for q in self.quantities.values())
+        )
 
     def table(self) -> list[dict[str, Any]]:
         """Tidy rows, one per quantity."""
         return [
-            {"quantity": q.name, "unit": q.unit, "true": q.true, "stated": q.stated, "spread": q.spread, "ratio": q.ratio,
-             "ratio_stderr": q.ratio_stderr, "core": q.core, "bias": q.bias, "bias_stderr": q.bias_stderr,
-             "coverage": q.coverage, "intervals": q.inside[1], "refits": len(q.values), "verdict": q.verdict}
+            {
+                "quantity": q.name,
+                "unit": q.unit,
+                "true": q.true,
+                "stated": q.stated,
+                "spread": q.spread,
+                "ratio": q.ratio,
+                "ratio_stderr": q.ratio_stderr,
+                "core": q.core,
+                "bias": q.bias,
+                "bias_stderr": q.bias_stderr,
+                "coverage": q.coverage,
+                "intervals": q.inside[1],
+                "refits": len(q.values),
+                "verdict": q.verdict,
+            }
             for q in self.quantities.values()
-        ]  # fmt: skip
+        ]
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """The rows of `table`."""
@@ -149,50 +172,81 @@ class Bootstrap(Printed, Result, eqx.Module):
         """Whether the stated errors hold, and what is off, in words."""
         done = self.replicates - len(self.failed)
         said = []
-        off = {verdict: [q.name for q in self.quantities.values() if q.verdict == verdict]
-               for verdict in ("error too small", "error too large", "intervals miss")}  # fmt: skip
+        off = {
+            verdict: [q.name for q in self.quantities.values() if q.verdict == verdict]
+            for verdict in ("error too small", "error too large", "intervals miss")
+        }
         holding = len(self.quantities) - sum(map(len, off.values()))
         if self.quantities and holding == len(self.quantities):
             said.append(f"the stated errors hold, as far as {done} refits can tell")
         elif self.quantities:
-            said.append(f"the stated errors hold for {holding} of {len(self.quantities)} quantities")
-        words = {"error too small": "refits scatter more than the fit states",
-                 "error too large": "refits scatter less than the fit states",
-                 "intervals miss": "the 95 % intervals of the refits hold the true value too seldom"}  # fmt: skip
+            said.append(
+                f"the stated errors hold for {holding} of {len(self.quantities)} quantities"
+            )
+        words = {
+            "error too small": "refits scatter more than the fit states",
+            "error too large": "refits scatter less than the fit states",
+            "intervals miss": "the 95 % intervals of the refits hold the true value too seldom",
+        }
         said += [f"{words[verdict]}: {', '.join(names)}" for verdict, names in off.items() if names]
-        tails = [f"{q.name} ({q.core:.2f})" for q in self.quantities.values()
-                 if q.verdict == "error too small" and q.core < 1 + (q.ratio - 1) / 2]  # fmt: skip
+        tails = [
+            f"{q.name} ({q.core:.2f})"
+            for q in self.quantities.values()
+            if q.verdict == "error too small" and q.core < 1 + (q.ratio - 1) / 2
+        ]
         if tails:
-            said.append("the large scatter comes mostly from a few outlying refits. Without them (middle 68 %), spread over "
-                        f"stated error: {', '.join(tails)}")  # fmt: skip
-        biased = [q.name for q in self.quantities.values() if abs(q.bias) > max(0.5 * q.stated, 3 * q.bias_stderr)]
+            said.append(
+                "the large scatter comes mostly from a few outlying refits. Without them (middle"
+                f" 68 %), spread over stated error: {', '.join(tails)}"
+            )
+        biased = [
+            q.name
+            for q in self.quantities.values()
+            if abs(q.bias) > max(0.5 * q.stated, 3 * q.bias_stderr)
+        ]
         if biased:
             said.append(f"off by more than half a standard error on average: {', '.join(biased)}")
-        silent = [f"{q.name} ({len(q.values) - q.inside[1]})" for q in self.quantities.values()
-                  if q.inside[1] < len(q.values)]  # fmt: skip
+        silent = [
+            f"{q.name} ({len(q.values) - q.inside[1]})"
+            for q in self.quantities.values()
+            if q.inside[1] < len(q.values)
+        ]
         if silent:
-            said.append(f"refits whose own data do not determine the quantity state no interval: {', '.join(silent)}")
+            said.append(
+                "refits whose own data do not determine the quantity state no interval:"
+                f" {', '.join(silent)}"
+            )
         if self.failed:
             first = next(iter(self.failed.items()))
-            said.append(f"{len(self.failed)} of {self.replicates} failed and are not in the table; replicate {first[0]}: "
-                        f"{first[1]}")  # fmt: skip
+            said.append(
+                f"{len(self.failed)} of {self.replicates} failed and are not in the table;"
+                f" replicate {first[0]}: {first[1]}"
+            )
         return (*said, self.source)
 
     def __str__(self) -> str:
         done = self.replicates - len(self.failed)
         lines = [f"{self.target}: {done} refits of data made from the fit"]
         wide = max(24, *(1 + len(name) for name in self.quantities)) if self.quantities else 24
-        lines.append(f"  {'':<{wide}}{'true':>9} {'stated':>8} {'spread/stated':>14} {'bias':>9} {'in 95 %':>7}")
+        lines.append(
+            f"  {'':<{wide}}{'true':>9} {'stated':>8} {'spread/stated':>14} {'bias':>9}"
+            f" {'in 95 %':>7}"
+        )
         for q in self.quantities.values():
             share = "-" if math.isnan(q.coverage) else f"{100 * q.coverage:.0f} %"
             mark = "" if q.verdict == "holds" else " *"
-            lines.append(f"  {q.name:<{wide}}{q.true:>9.4g} {q.stated:>8.2g} {q.ratio:>7.2f} ± {q.ratio_stderr:<4.2f} "
-                         f"{q.bias:>9.1g} {share:>7}{mark}")  # fmt: skip
+            lines.append(
+                f"  {q.name:<{wide}}{q.true:>9.4g} {q.stated:>8.2g} {q.ratio:>7.2f} ±"
+                f" {q.ratio_stderr:<4.2f} {q.bias:>9.1g} {share:>7}{mark}"
+            )
         return "\n".join([*lines, folded(f"- {sentence}" for sentence in self.sentences)])
 
     def to_json(self) -> str:
         """Everything but the task as JSON."""
-        rows = {q.name: {"values": with_nulls(q.values), "stderrs": with_nulls(q.stderrs)} for q in self.quantities.values()}
+        rows = {
+            q.name: {"values": with_nulls(q.values), "stderrs": with_nulls(q.stderrs)}
+            for q in self.quantities.values()
+        }
         table = {
             "format": FORMAT,
             "target": self.target,
@@ -200,7 +254,9 @@ class Bootstrap(Printed, Result, eqx.Module):
             "replicates": self.replicates,
             "failed": {str(number): why for number, why in self.failed.items()},
             "sentences": list(self.sentences),
-            "table": [{name: with_nulls(value) for name, value in row.items()} for row in self.table()],
+            "table": [
+                {name: with_nulls(value) for name, value in row.items()} for row in self.table()
+            ],
             "refits": rows,
             "seed": self.seed,
             "versions": self.versions,
@@ -212,10 +268,14 @@ class Bootstrap(Printed, Result, eqx.Module):
         write_text(path, self.to_json())
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
-        """The refits of every quantity, with the true value and the interval that the fit states."""
+        """The refits of every quantity, with the true value and the interval that the fit
+        states."""
         return plot.bootstrap(self, ax)
 
     def plot_coverage(self, ax: "Axes | None" = None) -> "Axes":
-        """How often the refits' own intervals hold the true value, at every level that they may state."""
-        places = {name: q.places for name, q in self.quantities.items() if base_of(name) not in BANDS}
+        """How often the refits' own intervals hold the true value, at every level that they may
+        state."""
+        places = {
+            name: q.places for name, q in self.quantities.items() if base_of(name) not in BANDS
+        }
         return plot.coverage({name: each for name, each in places.items() if len(each)}, ax=ax)

@@ -1,4 +1,5 @@
-"""Data as a fitted task would give them: recordings simulated nonlinearly, or spectra drawn from the law of a sigma."""
+"""Data as a fitted task would give them: recordings simulated nonlinearly, or spectra drawn from
+the law of a sigma."""
 
 import dataclasses
 import math
@@ -24,10 +25,14 @@ Datum = tuple[Target, float]
 Made = dict[int, tuple[Datum, ...]]
 
 
-def replicates_of(problem: FitProblem, tasks: tuple[AbstractTask, ...], count: int) -> tuple[Made, dict[int, str]]:
-    """Targets of every part with their mean output, as the tasks would give them; and why others could not be made.
+def replicates_of(
+    problem: FitProblem, tasks: tuple[AbstractTask, ...], count: int
+) -> tuple[Made, dict[int, str]]:
+    """Targets of every part with their mean output, as the tasks would give them; and why others
+    could not be made.
 
-    From the nonlinear simulator; where a target states no segments, drawn about its spectrum in linear response.
+    From the nonlinear simulator; where a target states no segments, drawn about its spectrum in
+    linear response.
     """
     failed: dict[int, str] = {}
     parts = []
@@ -39,12 +44,19 @@ def replicates_of(problem: FitProblem, tasks: tuple[AbstractTask, ...], count: i
         else:
             parts.append(_simulated(part, task, count, key, failed))
         parts[-1] = _with_stiffness(part, task, parts[-1], jax.random.fold_in(key, 77))
-    made = {n: tuple(part[n] for part in parts) for n in range(count) if all(n in part for part in parts)}
+    made = {
+        n: tuple(part[n] for part in parts)
+        for n in range(count)
+        if all(n in part for part in parts)
+    }
     return made, {n: why for n, why in failed.items() if n not in made}
 
 
-def _with_stiffness(part: Part, task: AbstractTask, made: dict[int, Datum], key: Array) -> dict[int, Datum]:
-    """The targets with dynamic stiffnesses that scatter about the task's as the measured one does, where there is one."""
+def _with_stiffness(
+    part: Part, task: AbstractTask, made: dict[int, Datum], key: Array
+) -> dict[int, Datum]:
+    """The targets with dynamic stiffnesses that scatter about the task's as the measured one does,
+    where there is one."""
     measured = part.target.stiffness
     if measured is None:
         return made
@@ -58,17 +70,31 @@ def _with_stiffness(part: Part, task: AbstractTask, made: dict[int, Datum], key:
     return found
 
 
-def _simulated(part: Part, task: AbstractTask, count: int, key: Array, failed: dict[int, str]) -> dict[int, Datum]:
-    """Targets from the nonlinear simulator, with their mean output; they scatter as much more as the target's trials do."""
+def _simulated(
+    part: Part, task: AbstractTask, count: int, key: Array, failed: dict[int, str]
+) -> dict[int, Datum]:
+    """Targets from the nonlinear simulator, with their mean output; they scatter as much more as
+    the target's trials do."""
     still = settled(task)
     trials = list(part.target.segments or ())
-    runs = [_runs(still, part.target, K, jax.random.fold_in(key, trial), np.arange(count), failed)
-            for trial, K in enumerate(trials)]  # fmt: skip
+    runs = [
+        _runs(still, part.target, K, jax.random.fold_in(key, trial), np.arange(count), failed)
+        for trial, K in enumerate(trials)
+    ]
     made, spread = {}, part.target.overdispersion
-    whole = {number: [each[number] for each in runs] for number in range(count) if all(number in each for each in runs)}
+    whole = {
+        number: [each[number] for each in runs]
+        for number in range(count)
+        if all(number in each for each in runs)
+    }
     # Trials count in proportion to their segments, as in the law of the bins.
-    powers = {n: np.average([row[0] for row in rows], axis=0, weights=trials)[part.chosen] for n, rows in whole.items()}
-    middle = np.exp(np.mean([np.log(power) for power in powers.values()], axis=0)) if powers else 1.0
+    powers = {
+        n: np.average([row[0] for row in rows], axis=0, weights=trials)[part.chosen]
+        for n, rows in whole.items()
+    }
+    middle = (
+        np.exp(np.mean([np.log(power) for power in powers.values()], axis=0)) if powers else 1.0
+    )
     for number, rows in whole.items():
         power = middle * (powers[number] / middle) ** spread
         target = _target(part.target, number, power, [row[1] for row in rows])
@@ -77,9 +103,15 @@ def _simulated(part: Part, task: AbstractTask, count: int, key: Array, failed: d
 
 
 def _runs(
-    task: Any, target: Target, segments: int, key: Array, numbers: np.ndarray, failed: dict[int, str]
+    task: Any,
+    target: Target,
+    segments: int,
+    key: Array,
+    numbers: np.ndarray,
+    failed: dict[int, str],
 ) -> dict[int, Any]:
-    """Welch power, coefficient of variation and mean of one trial of every replicate that stays finite."""
+    """Welch power, coefficient of variation and mean of one trial of every replicate that stays
+    finite."""
     settings = target.settings
     rate = float(slowest_rate(task))
     start = math.ceil(max(LEAD, FORGOTTEN / rate) * settings.rate) / settings.rate
@@ -91,13 +123,22 @@ def _runs(
             failed[int(numbers[0])] = str(error)
             return {}
         halves = np.array_split(numbers, 2)
-        return {n: x for half in halves for n, x in _runs(task, target, segments, key, half, failed).items()}
+        return {
+            n: x
+            for half in halves
+            for n, x in _runs(task, target, segments, key, half, failed).items()
+        }
     power, held = np.asarray(runs.spectrum(settings, window).power), runs.filtered(settings, window)
     variation = np.asarray(coefficient_of_variation(held))
-    return {int(n): (power[i], float(variation[i]), float(held[i].mean())) for i, n in enumerate(numbers)}
+    return {
+        int(n): (power[i], float(variation[i]), float(held[i].mean()))
+        for i, n in enumerate(numbers)
+    }
 
 
-def _target(like: Target, number: int, power: np.ndarray, variation: list[float], sigma: Any = None) -> Target:
+def _target(
+    like: Target, number: int, power: np.ndarray, variation: list[float], sigma: Any = None
+) -> Target:
     """A target as the given one, of other data; one coefficient of variation where that has one."""
     stated = like.coefficient_of_variation
     if stated is not None and len(stated) != len(variation):
@@ -115,16 +156,27 @@ def _target(like: Target, number: int, power: np.ndarray, variation: list[float]
     )
 
 
-def _drawn(problem: FitProblem, tasks: tuple[AbstractTask, ...], i: int, count: int, key: Array) -> dict[int, Datum]:
-    """Targets drawn from the Gaussian law about the fitted spectrum of one part in linear response."""
-    part, moments, keys = problem.parts[i], repeated(problem, tasks, count)[i], jax.random.split(key, 3)
+def _drawn(
+    problem: FitProblem, tasks: tuple[AbstractTask, ...], i: int, count: int, key: Array
+) -> dict[int, Datum]:
+    """Targets drawn from the Gaussian law about the fitted spectrum of one part in linear
+    response."""
+    part, moments, keys = (
+        problem.parts[i],
+        repeated(problem, tasks, count)[i],
+        jax.random.split(key, 3),
+    )
     power = drawn_spectra(Likelihood.of(problem).bins[i], part.target, moments, keys[0])
     scatter = [0.0 if given is None else float(given[1]) for given in (part.variation, part.mean)]
-    variation = moments.variation * np.exp(scatter[0] * np.asarray(jax.random.normal(keys[1], (count,))))
+    variation = moments.variation * np.exp(
+        scatter[0] * np.asarray(jax.random.normal(keys[1], (count,)))
+    )
     mean = moments.mean + scatter[1] * np.asarray(jax.random.normal(keys[2], (count,)))
     relative = np.asarray(part.target.sigma) / part.target.proportional_power
-    return {n: (_target(part.target, n, p, [float(v)], relative * p), float(m))
-            for n, (p, v, m) in enumerate(zip(power, variation, mean, strict=True))}  # fmt: skip
+    return {
+        n: (_target(part.target, n, p, [float(v)], relative * p), float(m))
+        for n, (p, v, m) in enumerate(zip(power, variation, mean, strict=True))
+    }
 
 
 def with_data(problem: FitProblem, data: tuple[Datum, ...]) -> FitProblem:

@@ -5,8 +5,28 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .console import absent, csv_text, err, keep_other_spectrum, out, plain, record, reporting, writable
-from .options import READING, Force, Formats, Json, Output, Recordings, SpectrumName, Window, formats_of
+from .console import (
+    absent,
+    csv_text,
+    err,
+    keep_other_spectrum,
+    out,
+    plain,
+    record,
+    reporting,
+    writable,
+)
+from .options import (
+    READING,
+    Force,
+    Formats,
+    Json,
+    Output,
+    Recordings,
+    SpectrumName,
+    Window,
+    formats_of,
+)
 from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed, unused, windows_of
 
 if TYPE_CHECKING:
@@ -23,36 +43,49 @@ def analyse(
     spectrum: Annotated[
         SpectrumName,
         typer.Option(
-            help="How the spectrum is estimated. standard: bins of 0.39 Hz. slow: bins of 0.1 Hz, to see below 1 Hz. "
-            "multitaper: also below 1 Hz, for recordings shorter than 30 s. pwelch: as MATLAB's pwelch does."
+            help=(
+                "How the spectrum is estimated. standard: bins of 0.39 Hz. slow: bins of 0.1 Hz, to"
+                " see below 1 Hz. "
+                "multitaper: also below 1 Hz, for recordings shorter than 30 s. pwelch: as MATLAB's"
+                " pwelch does."
+            )
         ),
     ] = SpectrumName.standard,
     mvc: Annotated[
         float | None,
         typer.Option(
-            metavar="FORCE", help="Maximal voluntary contraction, in the unit of the recording; gives the level in % MVC."
+            metavar="FORCE",
+            help=(
+                "Maximal voluntary contraction, in the unit of the recording; gives the level in %"
+                " MVC."
+            ),
         ),
     ] = None,
     output: Output = Path("out"),
     formats: Formats = None,
     save_target: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Save the spectrum as a .toml that `jaxmuscle fit` reads.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Save the spectrum as a .toml that `jaxmuscle fit` reads."
+        ),
     ] = None,
     force: Force = False,
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """Look at a recording, or at the trials of one person in one condition: level, variability, regularity, spectrum.
+    """Look at a recording, or at the trials of one person in one condition: level, variability,
+    regularity, spectrum.
 
-    The steady part of each recording is found automatically, unless --window gives it. The spectra of several trials are
-    averaged. Writes DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
+    The steady part of each recording is found automatically, unless --window gives it. The spectra
+    of several trials are averaged. Writes DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
 
-    If a motor moved the insertion, name both columns with --force-column and --displacement. Then you get the dynamic
-    stiffness instead, in DIR/analysis.json, DIR/response.csv and DIR/analysis.png.
+    If a motor moved the insertion, name both columns with --force-column and --displacement. Then
+    you get the dynamic stiffness instead, in DIR/analysis.json, DIR/response.csv and
+    DIR/analysis.png.
 
     Examples:
 
-        jaxmuscle analyse trial.csv --column force --rate 2048 --window 8:25 --save-target trial.toml
+        jaxmuscle analyse trial.csv --column force --rate 2048 --save-target trial.toml
 
         jaxmuscle analyse trial1.csv trial2.csv trial3.csv --save-target anna.toml
 
@@ -68,7 +101,10 @@ def analyse(
 
             positive("--mvc", mvc)
         if save_target is not None and save_target.suffix.lower() != ".toml":
-            raise ValueError(f"--save-target {save_target}: a target is saved as TOML; give a name that ends in .toml")
+            raise ValueError(
+                f"--save-target {save_target}: a target is saved as TOML; give a name that ends in"
+                " .toml"
+            )
         if save_target is not None:
             absent(save_target, force=force)
         moved = perturbed(reading)
@@ -76,19 +112,41 @@ def analyse(
         if moved:
             if save_target is not None or mvc is not None:
                 raise ValueError(
-                    "--save-target and --mvc belong to spectra, and this recording has a moved insertion: leave them out"
+                    "--save-target and --mvc belong to spectra, and this recording has a moved"
+                    " insertion: leave them out"
                 )
             if len(paths) > 1:
-                raise ValueError(f"{len(paths)} files are given; with force and displacement give one at a time")
+                raise ValueError(
+                    f"{len(paths)} files are given; with force and displacement give one at a time"
+                )
             return _write_perturbed(
-                read_perturbed(paths, reading, windows_of(window, len(paths)))[0], str(spectrum), output, formats_of(formats)
+                read_perturbed(paths, reading, windows_of(window, len(paths)))[0],
+                str(spectrum),
+                output,
+                formats_of(formats),
             )
-        unused(reading, *READING, what="recordings of a moved insertion, which need --force-column and --displacement")
-        _write(read_trials(paths, reading, window), str(spectrum), mvc, output, formats_of(formats), save_target)
+        unused(
+            reading,
+            *READING,
+            what="recordings of a moved insertion, which need --force-column and --displacement",
+        )
+        _write(
+            read_trials(paths, reading, window),
+            str(spectrum),
+            mvc,
+            output,
+            formats_of(formats),
+            save_target,
+        )
 
 
 def _write(
-    trials: "Trials", settings: str, mvc: float | None, folder: Path, formats: list[str], save_target: Path | None
+    trials: "Trials",
+    settings: str,
+    mvc: float | None,
+    folder: Path,
+    formats: list[str],
+    save_target: Path | None,
 ) -> None:
     from rich.box import HEAVY_HEAD, SIMPLE_HEAD
     from rich.table import Table
@@ -96,30 +154,54 @@ def _write(
     from jaxmuscle._common.figures import write_figure
     from jaxmuscle._common.files import write_json, write_text
 
-    spectrum, summaries = trials.spectrum(settings), [recording.summary(settings) for recording in trials]
+    spectrum, summaries = (
+        trials.spectrum(settings),
+        [recording.summary(settings) for recording in trials],
+    )
     proportional = spectrum.power / spectrum.power.sum()
-    columns = {"frequency_hz": spectrum.frequency, "power": spectrum.power, "proportional_power": proportional}
+    columns = {
+        "frequency_hz": spectrum.frequency,
+        "power": spectrum.power,
+        "proportional_power": proportional,
+    }
     names = ("name", "source", "unit", "rate", "window", "notices")
-    each = [{"recording": {key: getattr(recording, key) for key in names}, "summary": summary.to_dict()}
-            for recording, summary in zip(trials, summaries, strict=True)]  # fmt: skip
+    each = [
+        {"recording": {key: getattr(recording, key) for key in names}, "summary": summary.to_dict()}
+        for recording, summary in zip(trials, summaries, strict=True)
+    ]
     several = len(trials) > 1
     found = ({"trials": each} if several else each[0]) | {
-        "settings": spectrum.settings.to_dict(), "spectrum": {key: values.tolist() for key, values in columns.items()}
-    }  # fmt: skip
+        "settings": spectrum.settings.to_dict(),
+        "spectrum": {key: values.tolist() for key, values in columns.items()},
+    }
     target = None
     if save_target is not None or ((several or mvc is not None) and trials[0].quantity is not None):
-        target = trials.target(None if save_target is None else save_target.stem, settings=settings, mvc=mvc)
+        target = trials.target(
+            None if save_target is None else save_target.stem, settings=settings, mvc=mvc
+        )
     if several and target is not None:
         found["dispersion"] = target.dispersion
     figures = write_figure(trials.plot(settings), folder, "analysis", formats)
     keep_other_spectrum(folder, columns)
     write_text(folder / "spectrum.csv", csv_text(columns))
     write_json(folder / "analysis.json", found)
-    whole = target is not None and (several or target.mvc_fraction is not None)  # prints its notices itself
-    for notice in () if whole and not out.quiet else trials._notices(settings) if target is None else target.notices:
+    # prints its notices itself
+    whole = target is not None and (several or target.mvc_fraction is not None)
+    for notice in (
+        ()
+        if whole and not out.quiet
+        else trials._notices(settings)
+        if target is None
+        else target.notices
+    ):
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
-    table = Table(title=plain(trials.name if several else trials[0].source), title_justify="left", show_header=several,
-                  box=SIMPLE_HEAD if several else HEAVY_HEAD, padding=(0, 1))  # fmt: skip
+    table = Table(
+        title=plain(trials.name if several else trials[0].source),
+        title_justify="left",
+        show_header=several,
+        box=SIMPLE_HEAD if several else HEAVY_HEAD,
+        padding=(0, 1),
+    )
     table.add_column("", no_wrap=True)
     for recording in trials:
         rest = recording.name.removeprefix(trials.name).strip("_- .") or recording.name
@@ -128,9 +210,12 @@ def _write(
         table.add_row(row[0][0], *(plain(value) for _, value in row))
     out.print(table)
     if any(summary.peaks.local_maxima for summary in summaries):
-        out.print("Maxima are interpolated between bins. Local maxima are listed if they rise by at least 1 % of the "
-                  "highest power; they may be chance. A tremor is mostly smaller: jaxmuscle steadiness looks for its peak.",
-                  highlight=False)  # fmt: skip
+        out.print(
+            "Maxima are interpolated between bins. Local maxima are listed if they rise by at least"
+            " 1 % of the highest power; they may be chance. A tremor is mostly smaller: jaxmuscle"
+            " steadiness looks for its peak.",
+            highlight=False,
+        )
     if whole:
         out.print(plain(target), highlight=False)
     written = [f"{folder}/analysis.json, spectrum.csv", *figures]
@@ -142,7 +227,9 @@ def _write(
     out.print(f"Written: {', '.join(written)}", highlight=False)
 
 
-def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Path, formats: list[str]) -> None:
+def _write_perturbed(
+    recording: "PerturbedRecording", settings: str, folder: Path, formats: list[str]
+) -> None:
     from rich.table import Table
 
     from jaxmuscle._common.figures import write_figure
@@ -150,7 +237,10 @@ def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Pat
     from jaxmuscle._common.text import rounded
 
     response, delay = recording.frequency_response(settings), recording.delay(settings)
-    classical = {name: (m.value, float(m.stderr or 0.0), m.unit) for name, m in recording.second_order(settings).items()}
+    classical = {
+        name: (m.value, float(m.stderr or 0.0), m.unit)
+        for name, m in recording.second_order(settings).items()
+    }
     classical["delay"], misfit = (*delay, "s"), recording.second_order_misfit(settings)
     figures = write_figure(recording.plot(settings), folder, "analysis", formats)
     response.save(folder / "response.csv")
@@ -158,7 +248,10 @@ def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Pat
     found = {
         "recording": {key: getattr(recording, key) for key in names},
         "response": response.to_table(),
-        "second_order": {name: dict(zip(("value", "stderr", "unit"), row, strict=True)) for name, row in classical.items()},
+        "second_order": {
+            name: dict(zip(("value", "stderr", "unit"), row, strict=True))
+            for name, row in classical.items()
+        },
     }
     write_json(folder / "analysis.json", found)
     out.print(plain(recording), highlight=False)
@@ -169,14 +262,27 @@ def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Pat
     table = Table(title=title, title_justify="left", show_header=False)
     for name, (value, error, unit) in classical.items():
         told = (" ± ".join(rounded(value, error)), unit)
-        table.add_row(name, *(told if name != "delay" or error < VAGUE else ("not determined by this response", "")))
+        table.add_row(
+            name,
+            *(
+                told
+                if name != "delay" or error < VAGUE
+                else ("not determined by this response", "")
+            ),
+        )
     out.print(table)
     late = recording.late(settings)
     for notice in late:
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
     if misfit > MISSED and not late:
-        out.print(f"A spring, a damper and a mass do not describe these points: their chi2 is {misfit:.2g} times what it "
-                  "should be. Do not interpret K, B and I. Fit a muscle: jaxmuscle fit FILE --task prescribed-length",
-                  highlight=False)  # fmt: skip
+        out.print(
+            "A spring, a damper and a mass do not describe these points: their chi2 is"
+            f" {misfit:.2g} times what it should be. Do not interpret K, B and I. Fit a muscle:"
+            " jaxmuscle fit FILE --task prescribed-length",
+            highlight=False,
+        )
     record(found)
-    out.print(f"Written: {folder}/{', '.join(['analysis.json', 'response.csv', *figures])}", highlight=False)
+    out.print(
+        f"Written: {folder}/{', '.join(['analysis.json', 'response.csv', *figures])}",
+        highlight=False,
+    )

@@ -13,7 +13,18 @@ from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.names import file_names
 from jaxmuscle._common.progress import told
 
-from .console import BAD_INPUT, CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, record, writable, write_fit
+from .console import (
+    BAD_INPUT,
+    CONVERGED,
+    NOT_CONVERGED,
+    csv_text,
+    err,
+    out,
+    plain,
+    record,
+    writable,
+    write_fit,
+)
 from .options import TaskName
 from .reports import REPORT, cohort_report
 
@@ -28,7 +39,9 @@ SHOWN = {
     "harmonic_share": "harmonic\nshare",
     "high_frequency_floor": "floor",
 }
-CHI2 = "chi² per bin: squared distance of spectrum and fit in standard deviations, mean over the bins"
+CHI2 = (
+    "chi² per bin: squared distance of spectrum and fit in standard deviations, mean over the bins"
+)
 
 
 def fit_together(
@@ -42,7 +55,8 @@ def fit_together(
     *,
     force: bool,
 ) -> int:
-    """Fit and write all targets that can be read; the exit code says whether some could not be, or did not converge."""
+    """Fit and write all targets that can be read; the exit code says whether some could not be, or
+    did not converge."""
     grouped = {} if groups is None else _groups(groups)
     targets, failed = [], {}
     for name in names:
@@ -54,11 +68,20 @@ def fit_together(
     options = {name: value for name, value in options.items() if name != "starts"} | starts
     if not targets:
         raise ValueError(f"none of the targets can be read: {_reasons(failed)}")
-    places = {name: folder / place for name, place in file_names((t.name for t in targets), taken=FILES).items()}
-    writable(folder, "cohort.csv", *(f"{place.name}/fit.json" for place in places.values()), force=force)
+    places = {
+        name: folder / place
+        for name, place in file_names((t.name for t in targets), taken=FILES).items()
+    }
+    writable(
+        folder, "cohort.csv", *(f"{place.name}/fit.json" for place in places.values()), force=force
+    )
     with told(True, f"fitting {len(targets)} targets") as tell:
         found = jm.fit_cohort(
-            targets, groups=grouped, task=None if task is None else jm.model.TASKS[task], progress=tell, **options
+            targets,
+            groups=grouped,
+            task=None if task is None else jm.model.TASKS[task],
+            progress=tell,
+            **options,
         )
     failed |= found.failed
     if not found.results:
@@ -82,7 +105,8 @@ def _groups(path: Path) -> dict[str, str]:
         raise ValueError(f"{path}: is not CSV: {error}") from None
     if not rows or not {"target", "group"} <= set(rows[0]):
         raise ValueError(
-            f"{path}: has no columns target and group; write them as the first line, then a line for each target"
+            f"{path}: has no columns target and group; write them as the first line, then a line"
+            " for each target"
         )
     found: dict[str, str] = {}
     for number, row in enumerate(rows, start=2):
@@ -90,12 +114,17 @@ def _groups(path: Path) -> dict[str, str]:
         if not name or not group:
             raise ValueError(f"{path}: line {number}: a cell is empty; give a target and its group")
         if found.get(name, group) != group:
-            raise ValueError(f"{path}: line {number}: {name} is in group {found[name]} already; give each target one group")
+            raise ValueError(
+                f"{path}: line {number}: {name} is in group {found[name]} already; give each target"
+                " one group"
+            )
         found[name] = group
     return found
 
 
-def _write(cohort: "CohortResult", folder: Path, places: dict[str, Path], formats: list[str]) -> None:
+def _write(
+    cohort: "CohortResult", folder: Path, places: dict[str, Path], formats: list[str]
+) -> None:
     from jaxmuscle._common.figures import remove_figures, write_figure
     from jaxmuscle._common.files import remove, write_text
 
@@ -114,12 +143,23 @@ def _write(cohort: "CohortResult", folder: Path, places: dict[str, Path], format
     else:
         cohort_report(cohort, None, folder, places)
     fits = {name: str(places[name] / "fit.json") for name in cohort.results}
-    record({"success": cohort.success, "verdict": cohort.verdict, "table": cohort.table(), "differences": differences,
-            "failed": cohort.failed, "fits": fits})  # fmt: skip
+    record(
+        {
+            "success": cohort.success,
+            "verdict": cohort.verdict,
+            "table": cohort.table(),
+            "differences": differences,
+            "failed": cohort.failed,
+            "fits": fits,
+        }
+    )
 
 
 def _row(difference: Any) -> dict[str, Any]:
-    row = {name: getattr(difference, name) for name in ("quantity", "a", "b", "difference", "low", "high", "unit", "basis")}
+    row = {
+        name: getattr(difference, name)
+        for name in ("quantity", "a", "b", "difference", "low", "high", "unit", "basis")
+    }
     return row | {"members_a": difference.members[0], "members_b": difference.members[1]}
 
 
@@ -133,9 +173,13 @@ def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None
     table.add_column("target", overflow="fold")
     grouped = bool(cohort.groups)
     for column in [*["group"] * grouped, *SHOWN.values(), "chi²\nper\nbin"]:
-        table.add_column(column, justify="left" if column == "group" else "right", no_wrap=column != "group")
+        table.add_column(
+            column, justify="left" if column == "group" else "right", no_wrap=column != "group"
+        )
     for name, result in cohort.results.items():
-        cells = [plain(cohort.groups.get(name, ""))] * grouped + [_cell(result.derived.get(q)) for q in SHOWN]
+        cells = [plain(cohort.groups.get(name, ""))] * grouped + [
+            _cell(result.derived.get(q)) for q in SHOWN
+        ]
         chi2 = "" if result.chi2_per_bin is None else f"{result.chi2_per_bin:.2f}"
         chi2 = f"[bold red]{chi2}*[/]" if result.adequate is False else chi2
         table.add_row(plain(name), *cells, chi2 if result.success else "[bold red]failed[/]")
@@ -144,18 +188,30 @@ def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None
     out.print(plain(cohort.verdict), highlight=False)
     for d in cohort.differences():
         unit = "" if d.unit == "1" else f" {d.unit}"
-        out.print(f"{plain(d.quantity)}: {plain(d.b)} - {plain(d.a)} = {d.difference:.3g}{unit} "
-                  f"(95 %: {d.low:.3g} to {d.high:.3g})", highlight=False)  # fmt: skip
+        out.print(
+            f"{plain(d.quantity)}: {plain(d.b)} - {plain(d.a)} = {d.difference:.3g}{unit} "
+            f"(95 %: {d.low:.3g} to {d.high:.3g})",
+            highlight=False,
+        )
     for name, why in cohort.failed.items():
         err.print(f"[bold red]not fitted:[/] {plain(name)}: {plain(why)}", highlight=False)
     for name in cohort.results:
         if places[name].name != name:
-            words = f"{plain(name)}: cannot be the name of a folder here; its fit is in {plain(places[name])}"
+            words = (
+                f"{plain(name)}: cannot be the name of a folder here; its fit is in"
+                f" {plain(places[name])}"
+            )
             err.print(f"[yellow]notice:[/] {words}", highlight=False)
-    out.print(f"Written: {folder}/cohort.csv, {REPORT} and a folder for each target", highlight=False)
+    out.print(
+        f"Written: {folder}/cohort.csv, {REPORT} and a folder for each target", highlight=False
+    )
 
 
 def _cell(estimate: Any) -> str:
     if estimate is None:
         return ""
-    return f"({estimate.value:.3g})" if estimate.stderr is None else f"{estimate.value:.3g}±{estimate.stderr:.1g}"
+    return (
+        f"({estimate.value:.3g})"
+        if estimate.stderr is None
+        else f"{estimate.value:.3g}±{estimate.stderr:.1g}"
+    )

@@ -8,7 +8,18 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import CONVERGED, NOT_CONVERGED, aim_of, aimed, csv_text, out, plain, record, reporting, writable
+from .console import (
+    CONVERGED,
+    NOT_CONVERGED,
+    aim_of,
+    aimed,
+    csv_text,
+    out,
+    plain,
+    record,
+    reporting,
+    writable,
+)
 from .options import (
     Fix,
     Force,
@@ -37,8 +48,11 @@ def compare(
     target: Annotated[
         str,
         typer.Argument(
-            help="A bundled spectrum (see `jaxmuscle targets`), the file of one (.toml, .csv, .json, .tar), or "
-            "the fit.json of a fit, whose spectrum is taken."
+            help=(
+                "A bundled spectrum (see `jaxmuscle targets`), the file of one (.toml, .csv, .json,"
+                " .tar), or "
+                "the fit.json of a fit, whose spectrum is taken."
+            )
         ),
     ],
     task: TargetTask = None,
@@ -52,11 +66,12 @@ def compare(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Which noise? Fit one spectrum with each colour of noise and with richer models, and say which can be told apart.
+    """Which noise? Fit one spectrum with each colour of noise and with richer models, and say which
+    can be told apart.
 
-    Each colour is fitted with and without a harmonic (a regular rhythm). The richer models have activation or tremor. Writes
-    DIR/compare.csv, DIR/compare.json and DIR/compare.png, and prints the table. A model that is impossible in this task is
-    left out, and you are told why.
+    Each colour is fitted with and without a harmonic (a regular rhythm). The richer models have
+    activation or tremor. Writes DIR/compare.csv, DIR/compare.json and DIR/compare.png, and prints
+    the table. A model that is impossible in this task is left out, and you are told why.
 
     Examples:
 
@@ -75,7 +90,11 @@ def compare(
         fixed = fixed_values(fix)
         names = names_in(free)
         read = {"quantity": quantity, "segments": segments}
-        aim, model = _of_a_fit(target, task, read) if Path(target).name == FIT else aim_of(target, task, read)
+        aim, model = (
+            _of_a_fit(target, task, read)
+            if Path(target).name == FIT
+            else aim_of(target, task, read)
+        )
         writable(output, "compare.json", force=force)
         with told(True, f"comparing models on {aim.name}") as tell:
             found = jm.compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
@@ -89,10 +108,14 @@ def _of_a_fit(path: str, task: TaskName | None, read: dict[str, Any]) -> tuple[A
     """The spectrum of a fit of one target, and the task for it."""
     given = [name for name, value in read.items() if value is not None]
     if given:
-        raise ValueError(f"--{given[0]}: the spectrum of a fit states this already; leave the option out")
+        raise ValueError(
+            f"--{given[0]}: the spectrum of a fit states this already; leave the option out"
+        )
     targets = list(jm.load_result(path).targets.values())
     if len(targets) > 1:
-        raise ValueError(f"{path}: is a fit of {len(targets)} spectra; give the file of one of them")
+        raise ValueError(
+            f"{path}: is a fit of {len(targets)} spectra; give the file of one of them"
+        )
     return aimed(targets[0], task)
 
 
@@ -101,25 +124,35 @@ def _write(found: "Comparison", folder: Path, formats: list[str]) -> list[str]:
     from jaxmuscle._common.files import write_text
 
     rows = found.table()
-    write_text(folder / "compare.csv", csv_text({name: [row[name] for row in rows] for name in rows[0]}))
+    write_text(
+        folder / "compare.csv", csv_text({name: [row[name] for row in rows] for name in rows[0]})
+    )
     found.save(folder / "compare.json")
     return ["compare.csv", "compare.json", *write_figure(found.plot(), folder, "compare", formats)]
 
 
 def _unsettled(found: "Comparison") -> str:
-    """Whose search did not come to its end, and what may help: holding a parameter that the data say little about."""
+    """Whose search did not come to its end, and what may help: holding a parameter that the data
+    say little about."""
     rows = [row for row in found.rows if not row.success]
-    words = f"the search did not converge for {'; '.join(row.label for row in rows)}. Do not use these rows"
+    words = (
+        f"the search did not converge for {'; '.join(row.label for row in rows)}. Do not use these"
+        " rows"
+    )
     tasks = [found.tasks[row.noise, row.harmonic] for row in rows]
     common = set[str].intersection(*(set(task.parameter_names) for task in tasks))
     name = "resonance_width" if "resonance_width" in common else "c_z"
     value = float(tasks[0][name])
-    return (f"{words}. To help the search, fix a parameter of these models, for example --fix {name}={value:.2g}, or leave "
-            "that parameter out of --free")  # fmt: skip
+    return (
+        f"{words}. To help the search, fix a parameter of these models, for example --fix"
+        f" {name}={value:.2g}, or leave that parameter out of --free"
+    )
 
 
 def _show(found: "Comparison", files: str) -> None:
     out.print(plain(found), highlight=False, soft_wrap=True)
     if not found.success:
-        out.print(f"[bold red]failed:[/] {plain(_unsettled(found))}", highlight=False, soft_wrap=True)
+        out.print(
+            f"[bold red]failed:[/] {plain(_unsettled(found))}", highlight=False, soft_wrap=True
+        )
     out.print(f"Written: {files}", highlight=False)

@@ -34,7 +34,8 @@ err = Console(stderr=True, soft_wrap=not sys.stderr.isatty())  # a message is on
 
 
 def task_of(preset: str, task: TaskName | None, observe: Observed | None = None) -> Any:
-    """The task of a preset, its muscle put into another task if one is named; what it observes, if that is."""
+    """The task of a preset, its muscle put into another task if one is named; what it observes, if
+    that is."""
     model = jm.load_preset(preset)
     if task is not None and type(model) is not jm.model.TASKS[task]:
         model = model.as_task(jm.model.TASKS[task])
@@ -42,13 +43,15 @@ def task_of(preset: str, task: TaskName | None, observe: Observed | None = None)
         return model
     if not isinstance(model, jm.PrescribedForce):
         raise ValueError(
-            f"--observe {observe}: the output of {type(model).__name__} is no motion; add --task prescribed-force"
+            f"--observe {observe}: the output of {type(model).__name__} is no motion; add --task"
+            " prescribed-force"
         )
     return model.with_parts(observe=str(observe))
 
 
 def aim_of(name: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any, Any]:
-    """The target of that name or file, its notices said, and the task to fit to it: by default what the target measured.
+    """The target of that name or file, its notices said, and the task to fit to it: by default what
+    the target measured.
 
     A recording's steady part is found by itself.
     """
@@ -64,7 +67,8 @@ def aimed(target: Any, task: TaskName | None) -> tuple[Any, Any]:
 
 @contextlib.contextmanager
 def reporting(as_json: bool = False) -> Iterator[None]:
-    """Turn a user's mistake into one line and exit code 2, a numerical failure into 1, an interruption into 130 (or 143).
+    """Turn a user's mistake into one line and exit code 2, a numerical failure into 1, an
+    interruption into 130 (or 143).
 
     With `as_json` the text for people stays away from stdout, which is for `record` alone.
     """
@@ -88,11 +92,16 @@ def reporting(as_json: bool = False) -> Iterator[None]:
 
 
 def record(found: Any) -> None:
-    """With --json print what a command found as one JSON object, on one line; a path stands for what was written there."""
+    """With --json print what a command found as one JSON object, on one line; a path stands for
+    what was written there."""
     if out.quiet:
         from jaxmuscle._common.files import nulled
 
-        table = json.loads(found.read_text(encoding="utf-8")) if isinstance(found, Path) else nulled(found)
+        table = (
+            json.loads(found.read_text(encoding="utf-8"))
+            if isinstance(found, Path)
+            else nulled(found)
+        )
         print(json.dumps(table, allow_nan=False), flush=True)
 
 
@@ -104,7 +113,8 @@ def _words(error: Exception) -> str:
 
 
 def _as_options(message: str) -> str:
-    """A message as it reads at the command line: the arguments `rate` and `rate=20` are the options --rate and --rate 20."""
+    """A message as it reads at the command line: the arguments `rate` and `rate=20` are the options
+    --rate and --rate 20."""
     names = "|".join(SAME_NAME)
     message = re.sub(rf"(?<![\w.-])({names})=(?=\S)", lambda found: f"`{found[1]}` ", message)
     message = message.replace("`force`", "`force_column`")  # --force overwrites
@@ -112,16 +122,24 @@ def _as_options(message: str) -> str:
 
 
 def plain(text: object) -> str:
-    """Text without markup, each control character and half character as its escape: a file may be called anything."""
-    whole = str(text).encode("utf-8", "backslashreplace").decode().replace("\N{NO-BREAK SPACE}", " ")
-    shown = "".join(sign if sign.isprintable() or sign == "\n" else sign.encode("unicode_escape").decode() for sign in whole)
+    """Text without markup, each control character and half character as its escape: a file may be
+    called anything."""
+    whole = (
+        str(text).encode("utf-8", "backslashreplace").decode().replace("\N{NO-BREAK SPACE}", " ")
+    )
+    shown = "".join(
+        sign if sign.isprintable() or sign == "\n" else sign.encode("unicode_escape").decode()
+        for sign in whole
+    )
     return shown.replace("[", r"\[")
 
 
 def show(result: object, *, success: bool) -> None:
     """A result as it prints itself, its first line in colour."""
     first, *rest = str(result).splitlines()
-    out.print(f"[{'green' if success else 'bold red'}]{plain(first)}[/]", highlight=False, soft_wrap=True)
+    out.print(
+        f"[{'green' if success else 'bold red'}]{plain(first)}[/]", highlight=False, soft_wrap=True
+    )
     out.print(plain("\n".join(rest)), highlight=False, soft_wrap=True)
 
 
@@ -129,7 +147,8 @@ SPECTRUM = "spectrum.csv"  # of several commands
 
 
 def writable(folder: Path, *results: str, force: bool = False, reads: Iterable[str] = ()) -> None:
-    """Fail before the long work, not after it: also where one of the results is there already, unless it may go.
+    """Fail before the long work, not after it: also where one of the results is there already,
+    unless it may go.
 
     What the command itself `reads` is never replaced.
     """
@@ -137,32 +156,45 @@ def writable(folder: Path, *results: str, force: bool = False, reads: Iterable[s
         raise ValueError(f"--out {folder}: is a file; give the name of a folder")
     for name in reads:
         if Path(name).resolve() in [(folder / result).resolve() for result in (*results, SPECTRUM)]:
-            raise ValueError(f"--out {folder}: the result would replace {name}, the input: give another folder")
+            raise ValueError(
+                f"--out {folder}: the result would replace {name}, the input: give another folder"
+            )
     absent(*(folder / name for name in results), force=force)
     folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise ValueError(f"--out {folder}: you may not write there; give another folder, or change its permissions")
+        raise ValueError(
+            f"--out {folder}: you may not write there; give another folder, or change its"
+            " permissions"
+        )
 
 
 def absent(*results: Path, force: bool) -> None:
     """Raise a `ValueError` for a result that is there already, unless it may be overwritten."""
     for path in results:
         if path.exists() and not force:
-            raise ValueError(f"{path}: is there already; overwrite it with --force, or give another name")
+            raise ValueError(
+                f"{path}: is there already; overwrite it with --force, or give another name"
+            )
 
 
 def keep_other_spectrum(folder: Path, columns: Iterable[str]) -> None:
-    """Give the spectrum.csv of another command, which has other columns, a name of its own, and say so."""
+    """Give the spectrum.csv of another command, which has other columns, a name of its own, and say
+    so."""
     path = folder / SPECTRUM
     with contextlib.suppress(FileNotFoundError):
         with path.open(encoding="utf-8", errors="replace") as file:
             if file.readline().strip() == ",".join(columns):
                 return
         numbers = itertools.chain([""], (f"-{n}" for n in itertools.count(2)))
-        kept = next(name for n in numbers if not (name := folder / f"spectrum-other{n}.csv").exists())
+        kept = next(
+            name for n in numbers if not (name := folder / f"spectrum-other{n}.csv").exists()
+        )
         path.rename(kept)
-        err.print(f"[yellow]notice:[/] {plain(path)} was there, from another command. It is kept as {plain(kept)}.",
-                  highlight=False)  # fmt: skip
+        err.print(
+            f"[yellow]notice:[/] {plain(path)} was there, from another command. It is kept as"
+            f" {plain(kept)}.",
+            highlight=False,
+        )
 
 
 def csv_text(columns: dict[str, Any]) -> str:
@@ -170,7 +202,9 @@ def csv_text(columns: dict[str, Any]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows([_field(value) for value in row] for row in zip(*columns.values(), strict=True))
+    writer.writerows(
+        [_field(value) for value in row] for row in zip(*columns.values(), strict=True)
+    )
     return text.getvalue()
 
 
@@ -181,13 +215,19 @@ def _field(value: Any) -> str:
 
 
 def write_reached(stop: "FitInterrupted", folder: Path) -> None:
-    """Where an interrupted fit stood, a preset: to report the fit may take longer than a signal can wait."""
-    jm.save_preset(folder / REACHED, stop.tasks[0], description="where a fit stood when it was interrupted")
+    """Where an interrupted fit stood, a preset: to report the fit may take longer than a signal can
+    wait."""
+    jm.save_preset(
+        folder / REACHED, stop.tasks[0], description="where a fit stood when it was interrupted"
+    )
     stays(f"the best parameters so far are in {folder / REACHED}")
 
 
-def fit_into(folder: Path, target: str, read: dict[str, Any], asked: dict[str, Any], seed: int) -> "FitResult":
-    """The fit of that file, or of a target that is fitted now, which is saved as fit.json. Exit code 1 if it failed."""
+def fit_into(
+    folder: Path, target: str, read: dict[str, Any], asked: dict[str, Any], seed: int
+) -> "FitResult":
+    """The fit of that file, or of a target that is fitted now, which is saved as fit.json. Exit
+    code 1 if it failed."""
     from jaxmuscle._common.files import remove
 
     try:
@@ -199,7 +239,10 @@ def fit_into(folder: Path, target: str, read: dict[str, Any], asked: dict[str, A
         err.print(f"the fit is not finished; what it had reached is in {folder}/fit.json")
         raise
     if not result.success:
-        err.print(f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}", highlight=False)
+        err.print(
+            f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}",
+            highlight=False,
+        )
         raise typer.Exit(NOT_CONVERGED)
     result.save(folder / "fit.json")
     remove(folder, REACHED)
@@ -210,28 +253,46 @@ def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int)
     path = Path(target)
     if path.suffix == ".json" and path.is_file() and b'"task_table"' in path.read_bytes():
         if given := [f"--{name}" for name, value in (asked | read).items() if value is not None]:
-            raise ValueError(f"{target}: is a fit; its task, parameters and target stay as they are, so leave out "
-                             f"{', '.join(given)}")  # fmt: skip
+            raise ValueError(
+                f"{target}: is a fit; its task, parameters and target stay as they are, so leave"
+                f" out {', '.join(given)}"
+            )
         return jm.load_result(path)
     loaded, model = aim_of(target, asked["task"], read)
     if loaded.segments is None and loaded.sigma is None:
-        raise ValueError(f"{target}: does not say how much its bins scatter: give --segments, the number of Welch segments "
-                         "that were averaged, or a third column sigma")  # fmt: skip
+        raise ValueError(
+            f"{target}: does not say how much its bins scatter: give --segments, the number of"
+            " Welch segments that were averaged, or a third column sigma"
+        )
     names = names_in(asked["free"])
     with told(True, f"fitting {loaded.name}") as tell:
-        return jm.fit(model, loaded, free=names, fix=fixed_values(asked["fix"]), noise=asked["noise"], key=seed,
-                   progress=tell)  # fmt: skip
+        return jm.fit(
+            model,
+            loaded,
+            free=names,
+            fix=fixed_values(asked["fix"]),
+            noise=asked["noise"],
+            key=seed,
+            progress=tell,
+        )
 
 
-def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = (), *, report: bool = False) -> list[str]:
-    """fit.json, fit in each of the formats, tables, a report if it is wanted, each whole or not there; their names."""
+def write_fit(
+    result: "FitResult", folder: Path, formats: Iterable[str] = (), *, report: bool = False
+) -> list[str]:
+    """fit.json, fit in each of the formats, tables, a report if it is wanted, each whole or not
+    there; their names."""
     from jaxmuscle._common.figures import remove_figures, write_figure
     from jaxmuscle._common.files import remove, write_text
 
     from .reports import REPORT, fit_report
 
     tables = fit_tables(result)
-    earlier = [f"{table}-{name}.csv" for name in parts_of(folder / "fit.json") for table in ("spectrum", "stiffness")]
+    earlier = [
+        f"{table}-{name}.csv"
+        for name in parts_of(folder / "fit.json")
+        for table in ("spectrum", "stiffness")
+    ]
     keep_other_spectrum(folder, next(iter(result.parts.values())).columns())
     remove(folder, *tables, *earlier, REPORT)
     remove_figures(folder, "fit")
@@ -251,7 +312,8 @@ def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = (), *,
 
 
 def parts_of(path: Path) -> list[str]:
-    """What the targets of an earlier result are called in the names of its files; nothing where there is none."""
+    """What the targets of an earlier result are called in the names of its files; nothing where
+    there is none."""
     try:
         return list(file_names(json.loads(path.read_text(encoding="utf-8"))["parts"]).values())
     except (OSError, ValueError, KeyError, TypeError):
@@ -259,7 +321,8 @@ def parts_of(path: Path) -> list[str]:
 
 
 def fit_tables(result: "FitResult") -> dict[str, dict[str, Any]]:
-    """The tables of a fit by file, those without rows being empty: spectrum.csv, or spectrum-TARGET.csv of several."""
+    """The tables of a fit by file, those without rows being empty: spectrum.csv, or
+    spectrum-TARGET.csv of several."""
     tables: dict[str, dict[str, Any]] = {"spectrum.csv": {}, "stiffness.csv": {}}
     called = file_names(result.parts)
     for name, part in result.parts.items():

@@ -20,18 +20,26 @@ def explore(
         str | None,
         typer.Argument(
             metavar="[TARGET]",
-            help="What to begin with: a spectrum, a recording, a fit.json or a preset; by default the usual muscle.",
+            help=(
+                "What to begin with: a spectrum, a recording, a fit.json or a preset; by default"
+                " the usual muscle."
+            ),
         ),
     ] = None,
     task: TargetTask = None,
     segments: Segments = None,
     output: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="Write the page to this .html; by default to a temporary one."),
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help="Write the page to this .html; by default to a temporary one.",
+        ),
     ] = None,
     force: Force = False,
     browser: Annotated[
-        bool, typer.Option("--open/--no-open", help="Open the page in the browser, or only write it.")
+        bool,
+        typer.Option("--open/--no-open", help="Open the page in the browser, or only write it."),
     ] = True,
     as_json: Json = False,
 ) -> None:
@@ -68,7 +76,10 @@ def _content(what: str | None, task: TaskName | None, segments: int | None) -> t
     if "starts" in table and task is None:
         result = jm.load_result(Path(what).expanduser())
         if len(result.targets) > 1:
-            raise ValueError(f"{what} is a fit of several targets, and the page shows one: give the fit.json of one of them")
+            raise ValueError(
+                f"{what} is a fit of several targets, and the page shows one: give the fit.json of"
+                " one of them"
+            )
         return result.task, result.target
     if what in jm.list_presets() or "task_table" in table:
         return task_of(what, task), None
@@ -77,7 +88,8 @@ def _content(what: str | None, task: TaskName | None, segments: int | None) -> t
 
 
 def _table(path: Path) -> dict[str, Any]:
-    """What a JSON or TOML file holds, to see if it is a preset or a fit; nothing of what is not one of these."""
+    """What a JSON or TOML file holds, to see if it is a preset or a fit; nothing of what is not one
+    of these."""
     if path.suffix not in (".json", ".toml") or not path.is_file():
         return {}
     try:
@@ -89,7 +101,8 @@ def _table(path: Path) -> dict[str, Any]:
 
 
 def _place(output: Path | None, *, force: bool) -> Path:
-    """Where the page is written: as asked, else a file of its own in the folder for temporary files."""
+    """Where the page is written: as asked, else a file of its own in the folder for temporary
+    files."""
     if output is None:
         return Path(tempfile.mkdtemp(prefix="jaxmuscle-")) / "explorer.html"
     if output.suffix.lower() not in (".html", ".htm"):

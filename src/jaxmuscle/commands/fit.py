@@ -46,7 +46,14 @@ from .options import (
     formats_of,
     names_in,
 )
-from .recordings import NO_MOTION, read_recordings, read_with_holds, reads_perturbed, require_files, unused
+from .recordings import (
+    NO_MOTION,
+    read_recordings,
+    read_with_holds,
+    reads_perturbed,
+    require_files,
+    unused,
+)
 from .signals import STAYS, interrupted, stays
 
 RUNGS = 3  # richer models that may be tried
@@ -58,7 +65,10 @@ def fit(
     target: Annotated[
         list[str],
         typer.Argument(
-            help="A bundled spectrum (see `jaxmuscle targets`), your spectra (.toml, .csv, .json, .tar), or your recordings."
+            help=(
+                "A bundled spectrum (see `jaxmuscle targets`), your spectra (.toml, .csv, .json,"
+                " .tar), or your recordings."
+            )
         ),
     ],
     *,
@@ -68,8 +78,11 @@ def fit(
     method: Annotated[
         MethodName,
         typer.Option(
-            help="linear: the model's spectrum comes from a formula, corrected by simulations at the end. montecarlo: it is "
-            "simulated."
+            help=(
+                "linear: the model's spectrum comes from a formula, corrected by simulations at the"
+                " end. montecarlo: it is "
+                "simulated."
+            )
         ),
     ] = MethodName.linear,
     noise: Noise = None,
@@ -78,20 +91,31 @@ def fit(
         typer.Option(
             min=0,
             max=3,
-            help="Richest model that may be tried: 0 base, 1 with activation, 2 with tremor, 3 with a second resonance. "
-            "If you give several spectra, all get exactly this model.",
+            help=(
+                "Richest model that may be tried: 0 base, 1 with activation, 2 with tremor, 3 with"
+                " a second resonance. "
+                "If you give several spectra, all get exactly this model."
+            ),
         ),
     ] = None,
     rung: Annotated[
         int | None,
         typer.Option(
-            min=0, max=3, help="Fit just this model: 0 base, 1 with activation, 2 with tremor, 3 with a second resonance."
+            min=0,
+            max=3,
+            help=(
+                "Fit just this model: 0 base, 1 with activation, 2 with tremor, 3 with a second"
+                " resonance."
+            ),
         ),
     ] = None,
     residual: Annotated[
         ResidualName,
         typer.Option(
-            help="What is compared: log, the logarithm of the powers; linear, the powers; cumulative, their running sums."
+            help=(
+                "What is compared: log, the logarithm of the powers; linear, the powers;"
+                " cumulative, their running sums."
+            )
         ),
     ] = ResidualName.log,
     free: Free = None,
@@ -100,23 +124,32 @@ def fit(
         int | None,
         typer.Option(
             min=1,
-            help="How many starting points the search has: 100 by default, 32 with --hold and for each richer model, "
-            "8 if the task has no linear response.",
+            help=(
+                "How many starting points the search has: 100 by default, 32 with --hold and for"
+                " each richer model, "
+                "8 if the task has no linear response."
+            ),
         ),
     ] = None,
     seeds: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="How many recordings are simulated, each with its own noise: 32 by default, 48 if the task has no linear "
-            "response.",
+            help=(
+                "How many recordings are simulated, each with its own noise: 32 by default, 48 if"
+                " the task has no linear "
+                "response."
+            ),
         ),
     ] = None,
     increments: Annotated[
         Increments | None,
         typer.Option(
-            help="Random numbers of simulations: gaussian, or weak (cheaper and faster, good for means and spectra, not for "
-            "single traces).",
+            help=(
+                "Random numbers of simulations: gaussian, or weak (cheaper and faster, good for"
+                " means and spectra, not for "
+                "single traces)."
+            ),
             show_default="gaussian",
         ),
     ] = None,
@@ -124,23 +157,36 @@ def fit(
     segments: Segments = None,
     quantity: Quantity = None,
     dataset: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Which dataset to fit, if a digitised figure has several.")
+        str | None,
+        typer.Option(
+            metavar="NAME", help="Which dataset to fit, if a digitised figure has several."
+        ),
     ] = None,
     axis: Annotated[
         str | None,
         typer.Option(
-            help="Of a digitised figure: log-log if its points are log10 of Hz and of power. Of a motion-capture point: "
-            "x, y, z or principal."
+            help=(
+                "Of a digitised figure: log-log if its points are log10 of Hz and of power. Of a"
+                " motion-capture point: "
+                "x, y, z or principal."
+            )
         ),
     ] = None,
     groups: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="CSV with the columns target and group, to compare groups of spectra."),
+        typer.Option(
+            metavar="FILE",
+            help="CSV with the columns target and group, to compare groups of spectra.",
+        ),
     ] = None,
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="Leave out the simulated check, the harmonic's profile and p-value, figure and report."
+            "--quick",
+            help=(
+                "Leave out the simulated check, the harmonic's profile and p-value, figure and"
+                " report."
+            ),
         ),
     ] = False,
     output: Output = Path("out"),
@@ -149,27 +195,30 @@ def fit(
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """Fit the muscle to a force spectrum, to the recordings of one person, or to the spectra of many people.
+    """Fit the muscle to a force spectrum, to the recordings of one person, or to the spectra of
+    many people.
 
-    Recordings are trials of one person in one condition. Their spectra are averaged. Options such as --column say how they
-    are read.
+    Recordings are trials of one person in one condition. Their spectra are averaged. Options such
+    as --column say how they are read.
 
-    If a motor moved the insertion, give recordings with a column of force (or torque) and one of displacement (or angle).
-    Or give the frequency response: a CSV with the columns frequency, gain, phase, and coherence or stderr. Then
-    DIR/stiffness.csv holds the dynamic stiffness, measured and fitted.
+    If a motor moved the insertion, give recordings with a column of force (or torque) and one of
+    displacement (or angle). Or give the frequency response: a CSV with the columns frequency, gain,
+    phase, and coherence or stderr. Then DIR/stiffness.csv holds the dynamic stiffness, measured and
+    fitted.
 
-    With --hold recordings of the held insertion are fitted together with those of the moved one: same muscle, one P_w for
-    the moved ones and one for the holds. Here the table is printed only at the end. The tables of the spectra are
-    DIR/spectrum-moved.csv, DIR/spectrum-held.csv, and DIR/stiffness-moved.csv.
+    With --hold recordings of the held insertion are fitted together with those of the moved one:
+    same muscle, one P_w for the moved ones and one for the holds. Here the table is printed only at
+    the end. The tables of the spectra are DIR/spectrum-moved.csv, DIR/spectrum-held.csv, and
+    DIR/stiffness-moved.csv.
 
-    Several spectra are taken as those of several people. They are fitted together, by the formula of the spectrum alone,
-    without simulation.
+    Several spectra are taken as those of several people. They are fitted together, by the formula
+    of the spectrum alone, without simulation.
 
-    For one spectrum or person it prints a table as soon as the search has ended, then what the checks add. It writes
-    DIR/fit.json, DIR/fit.png, DIR/spectrum.csv and DIR/report.html.
+    For one spectrum or person it prints a table as soon as the search has ended, then what the
+    checks add. It writes DIR/fit.json, DIR/fit.png, DIR/spectrum.csv and DIR/report.html.
 
-    For several spectra it writes a folder DIR/TARGET for each, DIR/cohort.csv, DIR/cohort.png and DIR/report.html; with
-    --groups also DIR/differences.csv.
+    For several spectra it writes a folder DIR/TARGET for each, DIR/cohort.csv, DIR/cohort.png and
+    DIR/report.html; with --groups also DIR/differences.csv.
 
     Examples:
 
@@ -195,21 +244,34 @@ def fit(
         keep_compiled_programs()
         fixed = fixed_values(fix)
         names = names_in(free)
-        read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": "linear" if axis is None else axis}
+        read = {
+            "quantity": quantity,
+            "segments": segments,
+            "dataset": dataset,
+            "axis": "linear" if axis is None else axis,
+        }
         recorded = [jm.data.is_recording(name) for name in target]
-        if len(target) == 1 or any(recorded):  # of several spectra the others are fitted all the same
+        # of several spectra the others are fitted all the same
+        if len(target) == 1 or any(recorded):
             require_files(target)
         if any(recorded) and not all(recorded):
-            raise ValueError(f"{target[recorded.index(True)]} is a recording, {target[recorded.index(False)]} a spectrum. "
-                             "They cannot be fitted together: fit one at a time, or first make a spectrum of each recording "
-                             "with `jaxmuscle analyse ... --save-target FILE.toml`")  # fmt: skip
+            raise ValueError(
+                f"{target[recorded.index(True)]} is a recording, {target[recorded.index(False)]} a"
+                " spectrum. They cannot be fitted together: fit one at a time, or first make a"
+                " spectrum of each recording with `jaxmuscle analyse ... --save-target FILE.toml`"
+            )
         if hold and not all(recorded):
             raise ValueError(NO_MOTION)
         if rung is not None and (rungs is not None or (len(target) > 1 and not any(recorded))):
-            raise ValueError("--rung fits one model to one spectrum or to recordings of one condition: leave out --rungs "
-                             "(with several spectra --rungs says which model)")  # fmt: skip
+            raise ValueError(
+                "--rung fits one model to one spectrum or to recordings of one condition: leave out"
+                " --rungs (with several spectra --rungs says which model)"
+            )
         if rung and noise is not None:
-            raise ValueError("--rung: the models with activation and tremor have noise of their own; leave out --noise")
+            raise ValueError(
+                "--rung: the models with activation and tremor have noise of their own; leave out"
+                " --noise"
+            )
         options = {
             "free": names,
             "fix": fixed,
@@ -224,36 +286,55 @@ def fit(
             unused(reading, "axis", window=window, what="recordings; these are spectra")
 
             if method != MethodName.linear or seeds is not None or increments is not None or quick:
-                raise ValueError("several spectra are fitted in one go, without simulation: leave out "
-                                 "--method, --seeds, --increments and --quick, or fit them one at a time")  # fmt: skip
+                raise ValueError(
+                    "several spectra are fitted in one go, without simulation: leave out "
+                    "--method, --seeds, --increments and --quick, or fit them one at a time"
+                )
             options |= {"rung": rungs or 0}
-            raise typer.Exit(fit_together(target, read, task, groups, output, options, formats_of(formats), force=force))
+            raise typer.Exit(
+                fit_together(
+                    target, read, task, groups, output, options, formats_of(formats), force=force
+                )
+            )
         if groups is not None:
             raise ValueError(
-                "--groups compares several spectra; to compare recordings of several people use `jaxmuscle study`"
+                "--groups compares several spectra; to compare recordings of several people use"
+                " `jaxmuscle study`"
             )
         if any(recorded) and (segments is not None or dataset is not None):
-            raise ValueError("--segments and --dataset belong to spectra, and these are recordings: leave them out")
+            raise ValueError(
+                "--segments and --dataset belong to spectra, and these are recordings: leave"
+                " them out"
+            )
         if hold:
             simulated = {} if increments is None else {"increments": str(increments)}
             if method != MethodName.linear:
-                raise ValueError("with --hold all records are fitted by the formula of the spectrum: leave out --method")
+                raise ValueError(
+                    "with --hold all records are fitted by the formula of the spectrum: leave out"
+                    " --method"
+                )
             most = 0 if rung is not None or noise is not None or names else RUNGS
             options |= {"rungs": most if rungs is None else rungs}
             for name in fixed:
                 if "@" in name:
-                    raise ValueError(f"--fix {name}: with --hold a fixed value holds for all records. Give --fix "
-                                     f"{name.partition('@')[0]}=VALUE")  # fmt: skip
+                    raise ValueError(
+                        f"--fix {name}: with --hold a fixed value holds for all records. Give --fix"
+                        f" {name.partition('@')[0]}=VALUE"
+                    )
             if task not in (None, "prescribed-length") or quantity is not None:
-                raise ValueError("with --hold the records are those of a moved insertion, and of the force in a hold: leave "
-                                 "out --task and --quantity")  # fmt: skip
+                raise ValueError(
+                    "with --hold the records are those of a moved insertion, and of the force in a"
+                    " hold: leave out --task and --quantity"
+                )
             options |= simulated | {"starts": starts or 32, "seeds": 0 if quick else seeds or 32}
             given = read_with_holds(target, hold, reading, window)
             writable(output, "fit.json", force=force, reads=[*target, *hold])
             if rung is not None:
                 bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
                 options["tasks"] = {name: jm.on_rung(base, rung) for name, base in bases.items()}
-            converged = _fit_with_holds(*given, output, options, [] if quick else formats_of(formats))
+            converged = _fit_with_holds(
+                *given, output, options, [] if quick else formats_of(formats)
+            )
             raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
         options |= {"method": str(method), "seeds": seeds, "rungs": rungs if rung is None else 0}
         options |= {"check_seeds": 0} if quick else {}
@@ -265,7 +346,13 @@ def fit(
             else:
                 aim = aimed(found.target(quantity=quantity), task)
         elif jm.data.is_frequency_response(target[0]):
-            unused(reading, "axis", "lever_arm", window=window, what="recordings; this is a frequency response")
+            unused(
+                reading,
+                "axis",
+                "lever_arm",
+                window=window,
+                what="recordings; this is a frequency response",
+            )
             aim = aim_of(target[0], task, {"segments": segments, "lever_arm": reading["lever_arm"]})
         else:
             unused(reading, "axis", window=window, what="recordings; this is a spectrum")
@@ -277,7 +364,9 @@ def fit(
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
-def _fit_alone(seen: Any, model: Any, folder: Path, options: dict[str, Any], formats: list[str]) -> bool:
+def _fit_alone(
+    seen: Any, model: Any, folder: Path, options: dict[str, Any], formats: list[str]
+) -> bool:
     """One spectrum, or the recordings of one condition."""
 
     def fitted(tell: Any, answer: Any) -> Any:
@@ -286,17 +375,22 @@ def _fit_alone(seen: Any, model: Any, folder: Path, options: dict[str, Any], for
     return _fit_one(fitted, seen[0].name if isinstance(seen, list) else seen.name, folder, formats)
 
 
-def _fit_with_holds(moved: Any, held: Any, folder: Path, options: dict[str, Any], formats: list[str]) -> bool:
+def _fit_with_holds(
+    moved: Any, held: Any, folder: Path, options: dict[str, Any], formats: list[str]
+) -> bool:
     """Records of a moved and of a held insertion."""
 
     def fitted(tell: Any, answer: Any) -> Any:
-        return jm.fit_joint({"moved": moved, "held": held.target()}, progress=tell, answer=answer, **options)
+        return jm.fit_joint(
+            {"moved": moved, "held": held.target()}, progress=tell, answer=answer, **options
+        )
 
     return _fit_one(fitted, "the moved and the held record", folder, formats)
 
 
 def _fit_one(fit: Callable[[Any, Any], Any], called: str, folder: Path, formats: list[str]) -> bool:
-    """The table as soon as the search has ended, then what the checks add; the fit is written before these."""
+    """The table as soon as the search has ended, then what the checks add; the fit is written
+    before these."""
     printed = []
 
     def table(result: Any) -> None:
@@ -332,16 +426,24 @@ def _fit_one(fit: Callable[[Any, Any], Any], called: str, folder: Path, formats:
     if not printed:
         table(result)
     told_before = {*printed[0].remarks, *printed[0].notices}
-    new = [sentence for sentence in (*result.remarks, *(f"note: {notice}" for notice in result.notices))
-           if sentence.removeprefix("note: ") not in told_before]  # fmt: skip
+    new = [
+        sentence
+        for sentence in (*result.remarks, *(f"note: {notice}" for notice in result.notices))
+        if sentence.removeprefix("note: ") not in told_before
+    ]
     for sentence in new:
         out.print(plain(sentence), highlight=False)
     if new and _numbers(printed[0]) != _numbers(result):
-        out.print("The checks moved the last digits a little: cite the numbers in the files.", highlight=False)
+        out.print(
+            "The checks moved the last digits a little: cite the numbers in the files.",
+            highlight=False,
+        )
     out.print(f"Written: {folder}/{', '.join(files)}", highlight=False, soft_wrap=True)
     return result.success
 
 
 def _numbers(result: Any) -> dict[str, tuple[str, str]]:
     """The numbers of a fit as it prints them."""
-    return {n: (p.in_words(), p.interval_in_words()) for n, p in result.as_shown(result.found).items()}
+    return {
+        n: (p.in_words(), p.interval_in_words()) for n, p in result.as_shown(result.found).items()
+    }

@@ -12,7 +12,12 @@ from .options import Force, Formats, Json, Output, Quantity, Seed, Segments, Tar
 
 
 def identifiability(
-    target: Annotated[str, typer.Argument(help="A fit.json, a bundled spectrum, or the file of a spectrum or recording.")],
+    target: Annotated[
+        str,
+        typer.Argument(
+            help="A fit.json, a bundled spectrum, or the file of a spectrum or recording."
+        ),
+    ],
     task: TargetTask = None,
     segments: Segments = None,
     quantity: Quantity = None,
@@ -22,11 +27,12 @@ def identifiability(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """What should you measure next? Say what the data determine, and what further measurements would.
+    """What should you measure next? Say what the data determine, and what further measurements
+    would.
 
-    Fits first (unless given a fit.json). The further measurements are the usual ones: the mean force, the displacement under
-    a load, a moved insertion, another force level, a longer recording. Writes DIR/identifiability.json,
-    DIR/identifiability.png and DIR/fit.json.
+    Fits first (unless given a fit.json). The further measurements are the usual ones: the mean
+    force, the displacement under a load, a moved insertion, another force level, a longer
+    recording. Writes DIR/identifiability.json, DIR/identifiability.png and DIR/fit.json.
 
     Examples:
 
@@ -42,15 +48,25 @@ def identifiability(
         taken_up = Path(target).resolve() == (output / "fit.json").resolve()
         writable(output, *["fit.json"] * (not taken_up), "identifiability.json", force=force)
         asked = {"task": task, "noise": None, "free": None, "fix": None}
-        found = jm.identifiability(fit_into(output, target, {"segments": segments, "quantity": quantity}, asked, seed))
+        found = jm.identifiability(
+            fit_into(output, target, {"segments": segments, "quantity": quantity}, asked, seed)
+        )
         found.save(output / "identifiability.json")
         figures = write_figure(found.plot(), output, "identifiability", formats_of(formats))
         record(output / "identifiability.json")
         out.print(plain(found), highlight=False, soft_wrap=True)
-        out.print(f"Written: {output}/{', '.join(['identifiability.json', *figures, 'fit.json'])}", highlight=False)
+        out.print(
+            f"Written: {output}/{', '.join(['identifiability.json', *figures, 'fit.json'])}",
+            highlight=False,
+        )
         stiffness = found.present.quantities.get("K_w0")
         if stiffness is not None and not stiffness.determined:
-            out.print("How long must a record with a moved insertion be? For a standard error of 10 %, beginning with a "
-                      f"flat motion, ask: jaxmuscle design {output}/fit.json --quantity K_w_tangent --error 10 --spread 1. "
-                      "Its errors hold if m_z is about what the motor will move: first fit with your estimate in kg (--fix "
-                      "m_z=2.3, say), if you have not done so", highlight=False, soft_wrap=True)  # fmt: skip
+            out.print(
+                "How long must a record with a moved insertion be? For a standard error of 10 %,"
+                f" beginning with a flat motion, ask: jaxmuscle design {output}/fit.json --quantity"
+                " K_w_tangent --error 10 --spread 1. Its errors hold if m_z is about what the"
+                " motor will move: first fit with your estimate in kg (--fix m_z=2.3, say), if you"
+                " have not done so",
+                highlight=False,
+                soft_wrap=True,
+            )

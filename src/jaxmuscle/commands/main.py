@@ -58,14 +58,23 @@ def show_version(wanted: bool) -> bool:
 @app.callback()
 def common(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=show_version, help="Print the version and end.")
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=show_version, help="Print the version and end."
+        ),
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Also say which compiled programs are stored on disk and loaded again.")
+        bool,
+        typer.Option(
+            "--verbose",
+            "-v",
+            help="Also say which compiled programs are stored on disk and loaded again.",
+        ),
     ] = False,
 ) -> None:
-    """Fit a muscle model to measured force, analyse recordings, and simulate the fluctuations of force.
+    """Fit a muscle model to measured force, analyse recordings, and simulate the fluctuations of
+    force.
 
     `jaxmuscle COMMAND --help` explains a command and its options.
 
@@ -76,7 +85,9 @@ def common(
         jaxmuscle analyse trial.csv --column force --rate 2048
     """
     logging.basicConfig(format="%(message)s", stream=sys.stderr)
-    logging.getLogger("jaxmuscle").setLevel(logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO)
+    logging.getLogger("jaxmuscle").setLevel(
+        logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO
+    )
 
 
 @app.command()
@@ -121,7 +132,9 @@ def presets(as_json: Json = False) -> None:
 def main() -> None:
     """The command; `jaxmuscle.__main__` calls it and hears signals."""
     os.environ.setdefault("MPLBACKEND", "Agg")
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's remarks on slow compilation are not for users
-    # Tracing makes many objects that stay: a tenth of a command would go into looking for cycles among them.
+    # XLA's remarks on slow compilation are not for users
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # Tracing makes many objects that stay: a tenth of a command would go into looking for cycles
+    # among them.
     gc.set_threshold(200_000, 10, 10)
     app(prog_name="jaxmuscle")

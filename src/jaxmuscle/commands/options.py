@@ -56,134 +56,221 @@ class Observed(StrEnum):
     acceleration = "acceleration"
 
 
-Output = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results, made if it is not there.")]
+Output = Annotated[
+    Path,
+    typer.Option("--out", metavar="DIR", help="Folder for the results, made if it is not there."),
+]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite the results of an earlier run.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts, instead of text.")]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object, for scripts, instead of text.")
+]
 Formats = Annotated[
     list[FormatName] | None,
-    typer.Option("--format", help="Format of the figures, png by default; give it again for another.", show_default=False),
+    typer.Option(
+        "--format",
+        help="Format of the figures, png by default; give it again for another.",
+        show_default=False,
+    ),
 ]
 Seed = Annotated[
-    int, typer.Option(min=0, max=2**32 - 1, help="Seed of the random numbers: the same seed gives the same result.")
+    int,
+    typer.Option(
+        min=0,
+        max=2**32 - 1,
+        help="Seed of the random numbers: the same seed gives the same result.",
+    ),
 ]
 Preset = Annotated[
-    str, typer.Argument(help="A muscle in a task: a bundled preset (see `jaxmuscle presets`), a preset file or a fit.json.")
+    str,
+    typer.Argument(
+        help=(
+            "A muscle in a task: a bundled preset (see `jaxmuscle presets`), a preset file or a"
+            " fit.json."
+        )
+    ),
 ]
 OtherTask = Annotated[TaskName | None, typer.Option(help="Put the same muscle into this task.")]
 Observe = Annotated[
-    Observed | None, typer.Option(help="In the task prescribed-force: whether the output is displacement or acceleration.")
+    Observed | None,
+    typer.Option(
+        help="In the task prescribed-force: whether the output is displacement or acceleration."
+    ),
 ]
 TargetTask = Annotated[
-    TaskName | None, typer.Option(help="What is held in the experiment; by default it follows from what was measured.")
+    TaskName | None,
+    typer.Option(
+        help="What is held in the experiment; by default it follows from what was measured."
+    ),
 ]
 Noise = Annotated[
     NoiseName | None,
     typer.Option(
-        help="Colour of the noise, band-limited by default. If you give it, richer models are tried only with --rungs."
+        help=(
+            "Colour of the noise, band-limited by default. If you give it, richer models are tried"
+            " only with --rungs."
+        )
     ),
 ]
 Free = Annotated[
     str | None,
     typer.Option(
         metavar="NAMES",
-        help="Fit these parameters instead of the usual ones; put commas between names. Then `jaxmuscle fit` tries no "
-        "richer model, unless you give --rungs.",
+        help=(
+            "Fit these parameters instead of the usual ones; put commas between names. Then"
+            " `jaxmuscle fit` tries no richer model, unless you give --rungs."
+        ),
     ),
 ]
 Fix = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME=VALUE", help="Hold a parameter at a value; give it again for another parameter."),
+    typer.Option(
+        metavar="NAME=VALUE",
+        help="Hold a parameter at a value; give it again for another parameter.",
+    ),
 ]
 Segments = Annotated[
     int | None,
     typer.Option(
-        min=1, max=10**9, help="How many Welch segments were averaged. This number says how much each bin scatters."
+        min=1,
+        max=10**9,
+        help="How many Welch segments were averaged. This number says how much each bin scatters.",
     ),
 ]
-Quantity = Annotated[str | None, typer.Option(help="What was measured: force, torque, displacement or acceleration.")]
+Quantity = Annotated[
+    str | None, typer.Option(help="What was measured: force, torque, displacement or acceleration.")
+]
 Window = Annotated[
     str | None,
     typer.Option(
         metavar="A:B",
-        help="Part to analyse: A:B (from A to B in s), all, or auto (default: the program finds the steady part). For "
-        "several files, one each: A:B,auto (not in a study).",
+        help=(
+            "Part to analyse: A:B (from A to B in s), all, or auto (default: the program finds the"
+            " steady part). For several files, one each: A:B,auto (not in a study)."
+        ),
     ),
 ]
 Holds = Annotated[
     list[str] | None,
     typer.Option(
         metavar="FILE",
-        help="For a moved insertion: a recording of the same person with the insertion held, fitted together with it. "
-        "Give the option again for a further trial.",
+        help=(
+            "For a moved insertion: a recording of the same person with the insertion held, fitted"
+            " together with it. Give the option again for a further trial."
+        ),
     ),
 ]
 Recordings = Annotated[
     list[str],
     typer.Argument(
         metavar="RECORDING...",
-        help="Files of your sensor, one for each trial: text, .xlsx, .mat, .npy, .npz, .c3d, .edf, ...",
+        help=(
+            "Files of your sensor, one for each trial: text, .xlsx, .mat, .npy, .npz, .c3d,"
+            " .edf, ..."
+        ),
     ),
 ]
 _Name = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        help="Column, or motion-capture point, that holds the signal. Data:74 is column 74 of the table Data, counted from "
-        "0. all: every column is a trial (not in a study).",
+        help=(
+            "Column, or motion-capture point, that holds the signal. Data:74 is column 74 of the"
+            " table Data, counted from 0. all: every column is a trial (not in a study)."
+        ),
     ),
 ]
-_Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate in Hz, if the file does not state it.")]
-_Units = Annotated[
-    str | None, typer.Option(metavar="U", help="Unit of the signal: N, Nm, mm, m/s^2, % MVC, ...; by default the file's.")
+_Rate = Annotated[
+    float | None,
+    typer.Option(metavar="HZ", help="Sampling rate in Hz, if the file does not state it."),
 ]
-_Reference = Annotated[str | None, typer.Option(metavar="NAME", help="Column or point that is subtracted from the signal.")]
+_Units = Annotated[
+    str | None,
+    typer.Option(
+        metavar="U", help="Unit of the signal: N, Nm, mm, m/s^2, % MVC, ...; by default the file's."
+    ),
+]
+_Reference = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Column or point that is subtracted from the signal."),
+]
 _Time = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Column that holds the time, if the program does not find it.")
+    str | None,
+    typer.Option(
+        metavar="NAME", help="Column that holds the time, if the program does not find it."
+    ),
 ]
 _Arm = Annotated[
     float | None,
     typer.Option(
         metavar="M",
-        help="Distance in m from the joint's axis to the point where the force acts. A torque is divided by it and becomes "
-        "a force in N; an angle becomes a displacement.",
+        help=(
+            "Distance in m from the joint's axis to the point where the force acts. A torque is"
+            " divided by it and becomes a force in N; an angle becomes a displacement."
+        ),
     ),
 ]
-READING: dict[str, tuple[Any, Any]] = {  # how a recording is read: annotation and default of each option
+# how a recording is read: annotation and default of each option
+READING: dict[str, tuple[Any, Any]] = {
     "column": (_Name, None),
     "rate": (_Rate, None),
     "units": (_Units, None),
     "axis": (
         Annotated[
             str | None,
-            typer.Option(help="Direction of a motion-capture point: x, y, z, or principal for its largest motion."),
+            typer.Option(
+                help=(
+                    "Direction of a motion-capture point: x, y, z, or principal for its largest"
+                    " motion."
+                )
+            ),
         ],
         None,
     ),
     "reference": (_Reference, None),
     "time": (_Time, None),
     "skip_rows": (
-        Annotated[int, typer.Option(min=0, metavar="N", help="How many lines to leave out at the top of the file.")],
+        Annotated[
+            int,
+            typer.Option(
+                min=0, metavar="N", help="How many lines to leave out at the top of the file."
+            ),
+        ],
         0,
     ),
     "max_gap": (
         Annotated[
-            float, typer.Option(metavar="S", help="Longest gap in the recording, in s, that is filled by a straight line.")
+            float,
+            typer.Option(
+                metavar="S",
+                help="Longest gap in the recording, in s, that is filled by a straight line.",
+            ),
         ],
         0.2,
     ),
     "lever_arm": (_Arm, None),
 }
-_Force = Annotated[str | None, typer.Option(metavar="NAME", help="For a moved insertion: the column of the force.")]
+_Force = Annotated[
+    str | None, typer.Option(metavar="NAME", help="For a moved insertion: the column of the force.")
+]
 _Displacement = Annotated[
-    str | None, typer.Option(metavar="NAME", help="For a moved insertion: the column of its displacement.")
+    str | None,
+    typer.Option(metavar="NAME", help="For a moved insertion: the column of its displacement."),
 ]
 _Moved = Annotated[
     str | None,
-    typer.Option(metavar="U", help="Unit of the displacement: m, cm, mm, um, deg or rad; by default the file's."),
+    typer.Option(
+        metavar="U",
+        help="Unit of the displacement: m, cm, mm, um, deg or rad; by default the file's.",
+    ),
 ]
 _Positive = Annotated[
     str | None,
-    typer.Option(help="What a positive displacement is: lengthening or shortening; by default found from the data."),
+    typer.Option(
+        help=(
+            "What a positive displacement is: lengthening or shortening; by default found from the"
+            " data."
+        )
+    ),
 ]
 PERTURBED: dict[str, tuple[Any, Any]] = {  # the same for a file of force and displacement
     "force_column": (_Force, None),
@@ -193,7 +280,10 @@ PERTURBED: dict[str, tuple[Any, Any]] = {  # the same for a file of force and di
     "delay": (
         Annotated[
             float,
-            typer.Option(metavar="S", help="Delay in s of the force channel behind the displacement. It is corrected."),
+            typer.Option(
+                metavar="S",
+                help="Delay in s of the force channel behind the displacement. It is corrected.",
+            ),
         ],
         0.0,
     ),
@@ -219,7 +309,10 @@ def names_in(given: str | None, option: str = "--free") -> list[str] | None:
         return None
     names = [name.strip() for name in given.split(",") if name.strip()]
     if not names:
-        raise ValueError(f"{option} {given!r}: name at least one; put commas between several, as {option} k_w,c_w")
+        raise ValueError(
+            f"{option} {given!r}: name at least one; put commas between several, as {option}"
+            " k_w,c_w"
+        )
     return names
 
 
@@ -233,7 +326,9 @@ def fixed_values(pairs: list[str] | None) -> dict[str, float]:
         except ValueError:
             number = None
         if not (name.strip() and equals) or number is None or not math.isfinite(number):
-            raise ValueError(f"--fix {pair!r}: write NAME=VALUE with a number, for example --fix k_w=500000")
+            raise ValueError(
+                f"--fix {pair!r}: write NAME=VALUE with a number, for example --fix k_w=500000"
+            )
         if name.strip() in fixed:
             raise ValueError(f"--fix {pair!r}: {name.strip()} is fixed twice; give one value")
         fixed[name.strip()] = number

@@ -41,7 +41,12 @@ if TYPE_CHECKING:
 
 
 def posterior(
-    target: Annotated[str, typer.Argument(help="A bundled spectrum, the file of a spectrum or recording, or a fit.json.")],
+    target: Annotated[
+        str,
+        typer.Argument(
+            help="A bundled spectrum, the file of a spectrum or recording, or a fit.json."
+        ),
+    ],
     task: TargetTask = None,
     noise: Noise = None,
     free: Free = None,
@@ -54,10 +59,16 @@ def posterior(
         typer.Option(
             min=100,
             max=10**9,
-            help="How many draws each chain makes. If you leave it out: 600, or more (up to 3000) until they mix.",
+            help=(
+                "How many draws each chain makes. If you leave it out: 600, or more (up to 3000)"
+                " until they mix."
+            ),
         ),
     ] = None,
-    warmup: Annotated[int, typer.Option(min=1, max=10**9, help="How many steps each chain makes before its draws.")] = 400,
+    warmup: Annotated[
+        int,
+        typer.Option(min=1, max=10**9, help="How many steps each chain makes before its draws."),
+    ] = 400,
     seed: Seed = 0,
     output: Output = Path("out"),
     formats: Formats = None,
@@ -66,10 +77,11 @@ def posterior(
 ) -> None:
     """How sure is a fit? Draw from the posterior of the muscle's parameters.
 
-    The posterior is the probability of all parameters together, given your data. Fits first (unless given a fit.json), then
-    draws from the posterior with several random chains (Hamiltonian Monte Carlo). Writes DIR/fit.json, DIR/posterior.nc
-    (for ArviZ), DIR/posterior.json, corner.png, predictive.png, chains.png and report.html. The exit code is 1 if the fit
-    failed or the chains do not agree with each other. Then there is no summary.
+    The posterior is the probability of all parameters together, given your data. Fits first (unless
+    given a fit.json), then draws from the posterior with several random chains (Hamiltonian Monte
+    Carlo). Writes DIR/fit.json, DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png,
+    predictive.png, chains.png and report.html. The exit code is 1 if the fit failed or the chains
+    do not agree with each other. Then there is no summary.
 
     Examples:
 
@@ -84,16 +96,28 @@ def posterior(
 
         keep_compiled_programs()
         taken_up = Path(target).resolve() == (output / "fit.json").resolve()
-        writable(output, *["fit.json"] * (not taken_up), "posterior.nc", "posterior.json", force=force)
-        asked = {"task": task, "noise": None if noise is None else str(noise), "free": free, "fix": fix}
+        writable(
+            output, *["fit.json"] * (not taken_up), "posterior.nc", "posterior.json", force=force
+        )
+        asked = {
+            "task": task,
+            "noise": None if noise is None else str(noise),
+            "free": free,
+            "fix": fix,
+        }
         result = fit_into(output, target, {"segments": segments, "quantity": quantity}, asked, seed)
         try:
             with told(True, f"posterior of {result.title}") as tell:
-                found = jm.posterior(result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell)
+                found = jm.posterior(
+                    result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell
+                )
         except ImportError as error:
             raise ValueError(str(error)) from None
         except KeyboardInterrupt:
-            err.print(f"the fit stays: go on with jaxmuscle posterior {output}/fit.json --out {output}", soft_wrap=True)
+            err.print(
+                f"the fit stays: go on with jaxmuscle posterior {output}/fit.json --out {output}",
+                soft_wrap=True,
+            )
             raise
         _write(found, output, formats_of(formats))
         record(output / "posterior.json")
@@ -126,7 +150,10 @@ def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
 
 def _show(found: "Posterior", folder: Path) -> None:
     if not found.success:
-        err.print(f"[bold red]failed:[/] {plain(found.message)}; the chains are in {folder}", highlight=False)
+        err.print(
+            f"[bold red]failed:[/] {plain(found.message)}; the chains are in {folder}",
+            highlight=False,
+        )
         return
     show(found.summary(), success=True)
     out.print(f"written to {folder}", highlight=False)

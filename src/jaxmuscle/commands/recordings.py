@@ -1,4 +1,5 @@
-"""Recordings in commands: the options with which they are read, the same for every command that does."""
+"""Recordings in commands: the options with which they are read, the same for every command that
+does."""
 
 import functools
 import inspect
@@ -17,12 +18,17 @@ if TYPE_CHECKING:
     from jaxmuscle.data import Table
 
 
-NO_MOTION = ("--hold belongs to records of a moved insertion, with a column of force and one of displacement: fit a hold "
-             "alone as `jaxmuscle fit HOLD`")  # fmt: skip
+NO_MOTION = (
+    "--hold belongs to records of a moved insertion, with a column of force and one of"
+    " displacement: fit a hold alone as `jaxmuscle fit HOLD`"
+)
 
 
-def reads_recordings(command: Callable[..., None], options: Mapping[str, tuple[Any, Any]] = READING) -> Callable[..., None]:
-    """Give a command options, by default those of `READING`; it gets their values together, as its argument `reading`.
+def reads_recordings(
+    command: Callable[..., None], options: Mapping[str, tuple[Any, Any]] = READING
+) -> Callable[..., None]:
+    """Give a command options, by default those of `READING`; it gets their values together, as its
+    argument `reading`.
 
     An option of that name which the command has itself serves both.
     """
@@ -36,11 +42,16 @@ def reads_recordings(command: Callable[..., None], options: Mapping[str, tuple[A
     own = [parameter for name, parameter in signature.parameters.items() if name != "reading"]
     kept = {parameter.name for parameter in own}
     keyword = inspect.Parameter.KEYWORD_ONLY
-    added = [inspect.Parameter(name, keyword, default=default, annotation=annotation)
-             for name, (annotation, default) in options.items() if name not in kept]  # fmt: skip
+    added = [
+        inspect.Parameter(name, keyword, default=default, annotation=annotation)
+        for name, (annotation, default) in options.items()
+        if name not in kept
+    ]
     parameters = [parameter.replace(kind=keyword) for parameter in own] + added
     setattr(with_options, "__signature__", signature.replace(parameters=parameters))  # noqa: B010
-    with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    with_options.__annotations__ = {
+        parameter.name: parameter.annotation for parameter in parameters
+    }
     return with_options
 
 
@@ -51,7 +62,11 @@ def reads_perturbed(command: Callable[..., None]) -> Callable[..., None]:
 
 def unused(reading: dict[str, Any], *used: str, window: str | None = None, what: str) -> None:
     """Raise a `ValueError` for an option that is given and of no use here."""
-    given = [name for name, value in reading.items() if name not in used and value != (READING | PERTURBED)[name][1]]
+    given = [
+        name
+        for name, value in reading.items()
+        if name not in used and value != (READING | PERTURBED)[name][1]
+    ]
     if window is not None:
         given.append("window")
     if given:
@@ -66,7 +81,8 @@ def perturbed(reading: dict[str, Any]) -> bool:
 def read_recordings(
     paths: Sequence[str], reading: dict[str, Any], window: str | None, task: str | None
 ) -> "list[PerturbedRecording] | Trials":
-    """The recordings of one condition: of force and displacement, by the options, else by the task and the columns."""
+    """The recordings of one condition: of force and displacement, by the options, else by the task
+    and the columns."""
     if perturbed(reading):
         return read_perturbed(paths, reading, windows_of(window, len(paths)))
     if task not in (None, "prescribed-length") or reading["column"] is not None:
@@ -76,51 +92,81 @@ def read_recordings(
     both = all(found)
     if task is None and both and _held(tables, found):
         called = {names["force"] for names in found}
-        return read_trials(tables, reading | {"column": called.pop() if len(called) == 1 else None}, window)
+        return read_trials(
+            tables, reading | {"column": called.pop() if len(called) == 1 else None}, window
+        )
     if task == "prescribed-length" and not both:
-        raise ValueError(f"{paths[0]}: no displacement was found beside the force, and --task prescribed-length fits both: "
-                         "name the columns with --force-column and --displacement; a hold is fitted with --task "
-                         "isometric")  # fmt: skip
+        raise ValueError(
+            f"{paths[0]}: no displacement was found beside the force, and --task prescribed-length"
+            " fits both: name the columns with --force-column and --displacement; a hold is fitted"
+            " with --task isometric"
+        )
     if both:
         return read_perturbed(tables, reading, windows_of(window, len(tables)))
     return read_trials(tables, reading, window)
 
 
 def _held(tables: "Sequence[Table]", found: Sequence[dict[str, Any]]) -> bool:
-    """Whether the insertion rests in all files, though they have a column of where it is; said if so."""
-    moves = [jm.data.movement(table, names["displacement"]) for table, names in zip(tables, found, strict=True)]
+    """Whether the insertion rests in all files, though they have a column of where it is; said if
+    so."""
+    moves = [
+        jm.data.movement(table, names["displacement"])
+        for table, names in zip(tables, found, strict=True)
+    ]
     if not any(each.rests for each in moves):
         return False
     least, most = moves.index(min(moves)), moves.index(max(moves))
     if not all(each.rests for each in moves):
-        raise ValueError(f"{tables[least].file}: its column {found[least]['displacement']} rests (it moves by "
-                         f"{moves[least]}), and that of {tables[most].file} moves by {moves[most]}. Give the files of a "
-                         "moved insertion first, and those of a held one with --hold")  # fmt: skip
-    err.print(f"[yellow]notice:[/] {plain(found[most]['displacement'])} rests (it moves by {moves[most]}), so the force is "
-              "fitted as that of a hold. If a motor moved it, give --task prescribed-length", highlight=False)  # fmt: skip
+        raise ValueError(
+            f"{tables[least].file}: its column {found[least]['displacement']} rests (it moves by"
+            f" {moves[least]}), and that of {tables[most].file} moves by {moves[most]}. Give the"
+            " files of a moved insertion first, and those of a held one with --hold"
+        )
+    err.print(
+        f"[yellow]notice:[/] {plain(found[most]['displacement'])} rests (it moves by"
+        f" {moves[most]}), so the force is fitted as that of a hold. If a motor moved it, give"
+        " --task prescribed-length",
+        highlight=False,
+    )
     return True
 
 
 def read_with_holds(
     paths: Sequence[str], holds: Sequence[str], reading: dict[str, Any], window: str | None
 ) -> "tuple[list[PerturbedRecording], Trials]":
-    """Records of a moved insertion and those of the same person with the insertion held, which have the force alone."""
+    """Records of a moved insertion and those of the same person with the insertion held, which have
+    the force alone."""
     windows = windows_of(window, len(paths) + len(holds))
     tables = [table_of(path, reading) for path in paths]
     for path, table in zip(paths, tables, strict=True):
         if not perturbed(reading) and not channels(table, reading):
-            raise ValueError(f"{path}: no displacement was found beside the force. Name the columns with --force-column and "
-                             "--displacement. Or are the files swapped? Moved records come first, --hold takes the "
-                             "holds")  # fmt: skip
+            raise ValueError(
+                f"{path}: no displacement was found beside the force. Name the columns with"
+                " --force-column and --displacement. Or are the files swapped? Moved records come"
+                " first, --hold takes the holds"
+            )
     moved = read_perturbed(tables, reading, windows[: len(paths)])
-    held = jm.Trials([_hold(path, reading, edges) for path, edges in zip(holds, windows[len(paths) :], strict=True)])
+    held = jm.Trials(
+        [
+            _hold(path, reading, edges)
+            for path, edges in zip(holds, windows[len(paths) :], strict=True)
+        ]
+    )
     for recording in held:
         if recording.unit == "1":
-            raise ValueError(f"--hold {recording.name}: has no unit. Give --units N if all files are in newtons")
+            raise ValueError(
+                f"--hold {recording.name}: has no unit. Give --units N if all files are in newtons"
+            )
         if recording.unit not in NEWTONS:
-            remedy = "Give --lever-arm" if recording.quantity == "torque" else f"Give the hold in {', '.join(NEWTONS)}"
-            raise ValueError(f"--hold {recording.name}: is in {recording.unit}, and a moved record is fitted in N. "
-                             f"{remedy}")  # fmt: skip
+            remedy = (
+                "Give --lever-arm"
+                if recording.quantity == "torque"
+                else f"Give the hold in {', '.join(NEWTONS)}"
+            )
+            raise ValueError(
+                f"--hold {recording.name}: is in {recording.unit}, and a moved record is fitted in"
+                f" N. {remedy}"
+            )
     return moved, held
 
 
@@ -130,11 +176,14 @@ def _hold(path: str, reading: dict[str, Any], edges: Any) -> Any:
     if both := channels(table, reading | {"force_column": None, "displacement": None}):
         moves = jm.data.movement(table, both["displacement"])
         if not moves.rests:
-            raise ValueError(f"--hold {path}: its column {both['displacement']} moves by {moves}, and in a hold the "
-                             "insertion rests. Name this file among the moved records, before --hold")  # fmt: skip
+            raise ValueError(
+                f"--hold {path}: its column {both['displacement']} moves by {moves}, and in a hold"
+                " the insertion rests. Name this file among the moved records, before --hold"
+            )
     options = {name: reading[name] for name in READING} | {"reference": None}
     options["column"] = named if named in table.columns else None
-    as_it_is = read(table, options | {"lever_arm": None}, edges)  # in newtons, also where the moved records are torques
+    # in newtons, also where the moved records are torques
+    as_it_is = read(table, options | {"lever_arm": None}, edges)
     return as_it_is if as_it_is.quantity != "torque" else read(table, options, edges)
 
 
@@ -148,18 +197,29 @@ def read_perturbed(
     paths: "Sequence[str | Table]", reading: dict[str, Any], windows: Sequence[Any]
 ) -> "list[PerturbedRecording]":
     """The recordings of force and displacement in files, each with its window of `windows_of`."""
-    options = {name: value for name, value in reading.items() if name not in ("force_column", "displacement")}
+    options = {
+        name: value
+        for name, value in reading.items()
+        if name not in ("force_column", "displacement")
+    }
     named = {"force": reading["force_column"], "displacement": reading["displacement"]}
     tables = [table_of(path, reading) for path in paths]
     each = zip(tables, windows, strict=True)
-    return [read(table, options | (channels(table, reading) or named), edges) for table, edges in each]
+    return [
+        read(table, options | (channels(table, reading) or named), edges) for table, edges in each
+    ]
 
 
-def read_trials(paths: "Sequence[str | Table]", reading: dict[str, Any], window: str | None = None) -> "Trials":
-    """The recordings of one condition, each with its steady part: several files, or all columns of one (`--column all`)."""
+def read_trials(
+    paths: "Sequence[str | Table]", reading: dict[str, Any], window: str | None = None
+) -> "Trials":
+    """The recordings of one condition, each with its steady part: several files, or all columns of
+    one (`--column all`)."""
     if len(paths) > 1 or reading["column"] != "all":
         options, each = {name: reading[name] for name in READING}, windows_of(window, len(paths))
-        return jm.Trials([read(table_of(path, reading), options, e) for path, e in zip(paths, each, strict=True)])
+        return jm.Trials(
+            [read(table_of(path, reading), options, e) for path, e in zip(paths, each, strict=True)]
+        )
     (edges,) = windows_of(window, 1)
     options = {name: reading[name] for name in READING if name not in ("column", "reference")}
     trials = jm.load_recordings(table_of(paths[0], reading), **options)
@@ -195,8 +255,10 @@ def windows_of(window: str | None, recordings: int) -> list[Any]:
     each = [None] if window is None else [edges_of(part.strip()) for part in window.split(",")]
     if len(each) not in (1, recordings):
         whose = "one recording" if recordings == 1 else f"{recordings} recordings"
-        raise ValueError(f"--window {window}: {len(each)} windows for {whose}. Give one for all, or one for each in the "
-                         "order of the files, as --window 8:25,4:21 or --window 8:25,auto")  # fmt: skip
+        raise ValueError(
+            f"--window {window}: {len(each)} windows for {whose}. Give one for all, or one for each"
+            " in the order of the files, as --window 8:25,4:21 or --window 8:25,auto"
+        )
     return each * recordings if len(each) == 1 else each
 
 
@@ -212,4 +274,6 @@ def edges_of(window: str | None) -> Any:
             return float(start), float(stop)
     except ValueError:
         pass
-    raise ValueError(f"--window {window}: give start and end in s, as --window 8:25, or --window all")
+    raise ValueError(
+        f"--window {window}: give start and end in s, as --window 8:25, or --window all"
+    )

@@ -1,4 +1,5 @@
-"""report.html of a fit, a cohort, a study and a posterior: verdict, numbers, figures, what to do, how it was made."""
+"""report.html of a fit, a cohort, a study and a posterior: verdict, numbers, figures, what to do,
+how it was made."""
 
 import shlex
 import sys
@@ -14,17 +15,31 @@ if TYPE_CHECKING:
 
 REPORT = "report.html"
 WOULD = "What the data would determine if the model held"
-SPELT_OUT = {"carried": "multiplied, to come to the mean force"}  # names of settings that say too little
+# names of settings that say too little
+SPELT_OUT = {"carried": "multiplied, to come to the mean force"}
 STATE = 4  # the column of a fit's card that says whether the data determine a number
 PARAMETERS = ("name", "value", "95 % interval", "unit", "what it is")
 FIGURES = {
-    "fit": "Points: the data, with the range of one standard deviation. Blue line: fit. Bars: residuals, up where the data "
-    "lie above the fit; the grey bands are one and two standard deviations. Orange-red bars are beyond them.",
-    "stiffness": "Points: measured dynamic stiffness with two standard errors either way. Blue line: fit.",
-    "cohort": "What the data of at least half of the targets determine, with standard errors. Spectra: every target (thin), "
-    "the geometric mean of each group with its standard error (thick).",
-    "spectra": "Spectra of all people (thin), and the geometric mean of each group with its standard error (thick).",
-    "corner": "What the data determine. Diagonal: density, median and 95 % interval. Below it: regions of 50, 80 and 95 %.",
+    "fit": (
+        "Points: the data, with the range of one standard deviation. Blue line: fit. Bars:"
+        " residuals, up where the data lie above the fit; the grey bands are one and two standard"
+        " deviations. Orange-red bars are beyond them."
+    ),
+    "stiffness": (
+        "Points: measured dynamic stiffness with two standard errors either way. Blue line: fit."
+    ),
+    "cohort": (
+        "What the data of at least half of the targets determine, with standard errors. Spectra:"
+        " every target (thin), the geometric mean of each group with its standard error (thick)."
+    ),
+    "spectra": (
+        "Spectra of all people (thin), and the geometric mean of each group with its standard error"
+        " (thick)."
+    ),
+    "corner": (
+        "What the data determine. Diagonal: density, median and 95 % interval. Below it: regions of"
+        " 50, 80 and 95 %."
+    ),
     "predictive": "The target among spectra that the posterior predicts.",
     "chains": "Each line is a chain. Lines that lie upon each other agree.",
 }
@@ -33,24 +48,36 @@ FIGURES = {
 def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
     """Write report.html of a fit of one target, or of several of one person."""
     card = result.summary()
-    rows = {state: [row[:STATE] + row[STATE + 1 :] for row in card.rows if row[STATE] == state]
-            for state in ("determined", "not determined", "fixed")}  # fmt: skip
+    rows = {
+        state: [row[:STATE] + row[STATE + 1 :] for row in card.rows if row[STATE] == state]
+        for state in ("determined", "not determined", "fixed")
+    }
     body = [
         _verdict(card.heading, good=False if not result.success else result.adequate),
         pages.heading("What the data determine" if result.adequate is not False else WOULD),
-        pages.table(PARAMETERS, rows["determined"]) if rows["determined"] else pages.paragraph("Nothing."),
+        (
+            pages.table(PARAMETERS, rows["determined"])
+            if rows["determined"]
+            else pages.paragraph("Nothing.")
+        ),
         *_tried(result),
         pages.picture(figure, FIGURES["fit" if _has_spectrum(result) else "stiffness"]),
         pages.heading("What to know about this fit"),
         pages.items(card.remarks),
-        *([pages.paragraph("The data leave open:"), pages.items(result.undetermined)] if result.undetermined else []),
+        *(
+            [pages.paragraph("The data leave open:"), pages.items(result.undetermined)]
+            if result.undetermined
+            else []
+        ),
         pages.heading("What to do next"),
         pages.items(_after_a_fit(result, folder / "fit.json")),
     ]
     if rows["not determined"]:
-        body += [pages.heading("What the data do not determine"),
-                 pages.paragraph("Do not interpret these values."),
-                 pages.table(PARAMETERS, rows["not determined"])]  # fmt: skip
+        body += [
+            pages.heading("What the data do not determine"),
+            pages.paragraph("Do not interpret these values."),
+            pages.table(PARAMETERS, rows["not determined"]),
+        ]
     if rows["fixed"]:
         body += [pages.heading("What was fixed"), pages.table(PARAMETERS, rows["fixed"])]
     if methods := result.methods():
@@ -64,30 +91,58 @@ def _tried(result: "FitResult") -> list[Html]:
     """The models that were tried, where there were several."""
     if len(result.ladder) < 2:
         return []
-    rows = [(str(rung.number), rung.model, f"{rung.chi2_per_bin:.2f}", rung.p_in_words, f"{rung.aic:.1f}",
-             "the result" if rung.chosen else "") for rung in result.ladder]  # fmt: skip
+    rows = [
+        (
+            str(rung.number),
+            rung.model,
+            f"{rung.chi2_per_bin:.2f}",
+            rung.p_in_words,
+            f"{rung.aic:.1f}",
+            "the result" if rung.chosen else "",
+        )
+        for rung in result.ladder
+    ]
     return [
         pages.heading("Models tried"),
-        pages.paragraph("Simplest first. The numbers are those before the correction by simulation."),
+        pages.paragraph(
+            "Simplest first. The numbers are those before the correction by simulation."
+        ),
         pages.table(("", "model", "chi2 per bin", "p", "AIC", ""), rows),
     ]
 
 
-def cohort_report(cohort: "CohortResult", figure: Any | None, folder: Path, places: dict[str, Path]) -> None:
+def cohort_report(
+    cohort: "CohortResult", figure: Any | None, folder: Path, places: dict[str, Path]
+) -> None:
     """Write report.html of a cohort."""
     numbers = [
-        (row["target"], row["group"], row["quantity"], f"{row['value']:.3g} ± {row['stderr']:.2g}", _unit(row["unit"]))
+        (
+            row["target"],
+            row["group"],
+            row["quantity"],
+            f"{row['value']:.3g} ± {row['stderr']:.2g}",
+            _unit(row["unit"]),
+        )
         for row in cohort.table()
         if row["stderr"] is not None
     ]
     card = cohort.summary()
     body = [
-        _verdict(cohort.verdict, good=cohort.success and not any(r.adequate is False for r in cohort.results.values())),
+        _verdict(
+            cohort.verdict,
+            good=cohort.success and not any(r.adequate is False for r in cohort.results.values()),
+        ),
         pages.table(card.columns, card.rows),
         *([pages.picture(figure, FIGURES["cohort"])] if figure is not None else []),
     ]
     differences = [
-        (d.quantity, f"{d.b} - {d.a}", f"{d.difference:.3g}", f"{d.low:.3g} to {d.high:.3g}", _unit(d.unit))
+        (
+            d.quantity,
+            f"{d.b} - {d.a}",
+            f"{d.difference:.3g}",
+            f"{d.low:.3g} to {d.high:.3g}",
+            _unit(d.unit),
+        )
         for d in cohort.differences()
     ]
     if differences:
@@ -95,15 +150,25 @@ def cohort_report(cohort: "CohortResult", figure: Any | None, folder: Path, plac
         body += [pages.heading("What differs between groups"), pages.table(columns, differences)]
     body += [
         pages.heading("What the data determine"),
-        pages.table(("target", "group", "quantity", "value", "unit"), numbers) if numbers else pages.paragraph("Nothing."),
+        (
+            pages.table(("target", "group", "quantity", "value", "unit"), numbers)
+            if numbers
+            else pages.paragraph("Nothing.")
+        ),
         pages.heading("What to do next"),
-        pages.items((
-            "Fit a target alone for the checks that a cohort leaves out: `jaxmuscle fit TARGET`.",
-            "Do not interpret the numbers of a target that the model does not describe.",
-            "All numbers are in cohort.csv; each fit is in "
-            + ", ".join(f"`{place / 'fit.json'}`" for place in places.values()) + ".",
-        )),
-    ]  # fmt: skip
+        pages.items(
+            (
+                (
+                    "Fit a target alone for the checks that a cohort leaves out: `jaxmuscle fit"
+                    " TARGET`."
+                ),
+                "Do not interpret the numbers of a target that the model does not describe.",
+                "All numbers are in cohort.csv; each fit is in "
+                + ", ".join(f"`{place / 'fit.json'}`" for place in places.values())
+                + ".",
+            )
+        ),
+    ]
     first = next(iter(cohort.results.values()))
     body += _how(first.settings | {"method": first.method, "seed": first.seed}, first.versions)
     pages.write_page(folder / REPORT, f"{len(cohort.results)} targets", body)
@@ -117,9 +182,29 @@ def study_report(study: "StudyResult", folder: Path) -> None:
     shown = pages.picture(figure, FIGURES["spectra"])
     plt.close(figure)
     differences = sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))
-    rows = [(d.quantity, d.where, f"{d.b} - {d.a}", f"{d.difference:.3g}", f"{d.low:.3g} to {d.high:.3g}", _unit(d.unit),
-             f"{d.p:.2g}", "" if d.p_corrected is None else f"{d.p_corrected:.2g}") for d in differences]  # fmt: skip
-    columns = ("quantity", "condition", "comparison", "difference", "interval", "unit", "p", "p corrected")
+    rows = [
+        (
+            d.quantity,
+            d.where,
+            f"{d.b} - {d.a}",
+            f"{d.difference:.3g}",
+            f"{d.low:.3g} to {d.high:.3g}",
+            _unit(d.unit),
+            f"{d.p:.2g}",
+            "" if d.p_corrected is None else f"{d.p_corrected:.2g}",
+        )
+        for d in differences
+    ]
+    columns = (
+        "quantity",
+        "condition",
+        "comparison",
+        "difference",
+        "interval",
+        "unit",
+        "p",
+        "p corrected",
+    )
     fits = [(name, result.verdict) for name, result in study.cohort.results.items()]
     fits += [(name, f"not fitted: {why}") for name, why in study.cohort.failed.items()]
     body = [
@@ -133,18 +218,29 @@ def study_report(study: "StudyResult", folder: Path) -> None:
         pages.heading("For your methods section"),
         pages.paragraph(study.methods()),
         pages.heading("What to do next"),
-        pages.items((
-            "Look at people whom the model does not describe, before you interpret a difference.",
-            "Report p corrected, and how many people were left out of each comparison.",
-            "All numbers are in people.csv and differences.csv.",
-        )),
-        *_how(study.options | {"source": study.source}, next(iter(study.cohort.results.values())).versions),
-    ]  # fmt: skip
+        pages.items(
+            (
+                (
+                    "Look at people whom the model does not describe, before you interpret a"
+                    " difference."
+                ),
+                "Report p corrected, and how many people were left out of each comparison.",
+                "All numbers are in people.csv and differences.csv.",
+            )
+        ),
+        *_how(
+            study.options | {"source": study.source},
+            next(iter(study.cohort.results.values())).versions,
+        ),
+    ]
     pages.write_page(folder / REPORT, "Study", body)
 
 
-def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path, drawn: dict[str, bytes]) -> None:
-    """Write report.html of a posterior. `drawn` has the PNG of figures that have too many lines for SVG."""
+def posterior_report(
+    found: "Posterior", figures: dict[str, Any], folder: Path, drawn: dict[str, bytes]
+) -> None:
+    """Write report.html of a posterior. `drawn` has the PNG of figures that have too many lines for
+    SVG."""
     body = [_verdict(found.message, good=found.success)]
     if found.success:
         summary = found.summary()
@@ -154,14 +250,26 @@ def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path, 
             told = summary[name]
             unit, size = _unit(summary.units[name]), min(told["ess_bulk"], told["ess_tail"])
             rows[name in found.determined].append(
-                (name, f"{told['median']:.4g}", f"{told['low']:.4g} to {told['high']:.4g}", unit,
-                 f"{told['r_hat']:.3f}", f"{size:.0f}")
-            )  # fmt: skip
+                (
+                    name,
+                    f"{told['median']:.4g}",
+                    f"{told['low']:.4g} to {told['high']:.4g}",
+                    unit,
+                    f"{told['r_hat']:.3f}",
+                    f"{size:.0f}",
+                )
+            )
         body += [pages.heading("What the data determine"), pages.table(columns, rows[True])]
         body += _pictures(figures, drawn)
-        body += [pages.heading("What the data do not determine"),
-                 pages.paragraph("These come from the prior. Do not interpret them."),
-                 pages.table(columns, rows[False])] if rows[False] else []  # fmt: skip
+        body += (
+            [
+                pages.heading("What the data do not determine"),
+                pages.paragraph("These come from the prior. Do not interpret them."),
+                pages.table(columns, rows[False]),
+            ]
+            if rows[False]
+            else []
+        )
         after = (
             "Report medians with their 95 % intervals, R-hat and the effective sample sizes.",
             "All draws are in posterior.nc: `arviz.from_netcdf` reads it.",
@@ -171,8 +279,10 @@ def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path, 
         after = (
             "Do not use these draws.",
             "Draw longer: `--warmup 2000 --draws 4000`.",
-            "Or fit again with some of the parameters fixed that the data do not determine "
-            "(`jaxmuscle fit ... --fix NAME=VALUE`), and draw from that fit.",
+            (
+                "Or fit again with some of the parameters fixed that the data do not determine "
+                "(`jaxmuscle fit ... --fix NAME=VALUE`), and draw from that fit."
+            ),
         )
     body += [pages.heading("What to know about this posterior"), pages.code(str(found))]
     body += [pages.heading("What to do next"), pages.items(after)]
@@ -187,7 +297,8 @@ def _unit(unit: str) -> str:
 
 def _pictures(figures: dict[str, Any], drawn: dict[str, bytes]) -> list[Html]:
     return [
-        pages.picture(figure, FIGURES[name.partition("-")[0]], pixels=drawn.get(name)) for name, figure in figures.items()
+        pages.picture(figure, FIGURES[name.partition("-")[0]], pixels=drawn.get(name))
+        for name, figure in figures.items()
     ]
 
 
@@ -207,7 +318,10 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
         ]
     if result.adequate is None:
         return [
-            "Say how much the powers scatter: `--segments N`, the number of Welch segments that were averaged.",
+            (
+                "Say how much the powers scatter: `--segments N`, the number of Welch segments that"
+                " were averaged."
+            ),
             "Then the fit can be judged.",
         ]
     single = len(result.parts) == 1
@@ -219,7 +333,10 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
             "Look at the residuals: orange-red bars are where the model misses the data.",
             "See whether the recording drifts: `jaxmuscle analyse RECORDING`.",
             *(
-                [f"Try other noises: `jaxmuscle compare {place} --out {other}`. That takes as long as all fits so far."]
+                [
+                    f"Try other noises: `jaxmuscle compare {place} --out {other}`. That takes as"
+                    " long as all fits so far."
+                ]
                 if single and _has_spectrum(result)
                 else []
             ),
@@ -228,9 +345,12 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
         f"How sure is each number? `jaxmuscle posterior {place}` draws from the posterior.",
         *([f"Move the parameters yourself: `jaxmuscle explore {place}`."] if single else []),
         f"What should you measure to know the rest? `jaxmuscle identifiability {place}`.",
-        'In a paper, give the parameters under "What the data determine" with their intervals, unless a note says not to. '
-        "Take mean, variation and bands from `jaxmuscle steadiness`, which needs no model. If the model has a tremor, leave "
-        "out high_frequency_floor: there it holds the tremor, too.",
+        (
+            'In a paper, give the parameters under "What the data determine" with their intervals,'
+            " unless a note says not to. Take mean, variation and bands from `jaxmuscle"
+            " steadiness`, which needs no model. If the model has a tremor, leave out"
+            " high_frequency_floor: there it holds the tremor, too."
+        ),
         "Name those that the data do not determine.",
     ]
 
@@ -248,6 +368,10 @@ def _how(settings: dict[str, Any], versions: dict[str, str]) -> list[Html]:
     return [
         pages.heading("How to repeat this"),
         pages.code(shlex.join(["jaxmuscle", *sys.argv[1:]])),
-        pages.settings_table({SPELT_OUT.get(name, name): value for name, value in settings.items()}),
-        pages.paragraph("Versions: " + ", ".join(f"{name} {number}" for name, number in versions.items())),
+        pages.settings_table(
+            {SPELT_OUT.get(name, name): value for name, value in settings.items()}
+        ),
+        pages.paragraph(
+            "Versions: " + ", ".join(f"{name} {number}" for name, number in versions.items())
+        ),
     ]

@@ -17,7 +17,10 @@ def reproduce(
     recording: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="FILE", help="Recording of a person for Figures 7 and 8; give it three times, for three people."
+            metavar="FILE",
+            help=(
+                "Recording of a person for Figures 7 and 8; give it three times, for three people."
+            ),
         ),
     ] = None,
     force: Force = False,
@@ -25,8 +28,8 @@ def reproduce(
 ) -> None:
     """Draw the figures of the paper and check what its text states.
 
-    The paper is that of Zagrodny, Wojnicz, Ludwicki and Barański, from which the model is. Writes DIR/index.html (open it in
-    a browser), DIR/fig2 ... fig8 as .png and .pdf, and DIR/claims.json.
+    The paper is that of Zagrodny, Wojnicz, Ludwicki and Barański, from which the model is. Writes
+    DIR/index.html (open it in a browser), DIR/fig2 ... fig8 as .png and .pdf, and DIR/claims.json.
 
     Examples:
 
@@ -51,4 +54,6 @@ def _reproduce(folder: Path, given) -> None:
         if row.verdict == "does not agree":
             says = f"does not agree ({row.kind}): {row.says} ({row.source}): {row.ours}"
             out.print(says, highlight=False, markup=False)
-    out.print(f"Written: {folder}/index.html, fig2 to fig8 (.png, .pdf), claims.json", highlight=False)
+    out.print(
+        f"Written: {folder}/index.html, fig2 to fig8 (.png, .pdf), claims.json", highlight=False
+    )

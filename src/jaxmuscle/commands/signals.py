@@ -1,8 +1,10 @@
-"""Signals: Ctrl-C, SIGTERM and SIGHUP end a command within ten seconds, whatever it does, and what was reached is kept.
+"""Signals: Ctrl-C, SIGTERM and SIGHUP end a command within ten seconds, whatever it does, and what
+was reached is kept.
 
-A signal raises `KeyboardInterrupt` in the main thread. Python can do that between two of its own instructions only, not
-while XLA compiles or a compiled program runs. So a thread beside it ends the process if the main thread does not come back.
-Nothing is half written then: files are renamed into place.
+A signal raises `KeyboardInterrupt` in the main thread. Python can do that between two of its own
+instructions only, not while XLA compiles or a compiled program runs. So a thread beside it ends the
+process if the main thread does not come back. Nothing is half written then: files are renamed into
+place.
 """
 
 import atexit
@@ -21,7 +23,9 @@ from typing import Any, NoReturn, TextIO
 LIMIT = 7.0  # seconds from the first signal to the end
 PATIENCE = 1.0  # a second signal so many seconds later ends the process at once
 SOON = 0.05
-ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+ENDING = [
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+]
 LATER = getattr(signal, "SIGALRM", None)
 OURS = [number for number in (*ENDING, LATER) if number is not None]
 IMPORTS = "<frozen importlib"
@@ -30,7 +34,8 @@ SHOW_CURSOR = "\x1b[?25h"  # a bar of rich has hidden it
 
 
 class Ear:
-    """Handler of the signals that end a command; `code` is 128 and the number of the first that came, until then 0."""
+    """Handler of the signals that end a command; `code` is 128 and the number of the first that
+    came, until then 0."""
 
     def __init__(self) -> None:
         self.code = 0
@@ -53,22 +58,26 @@ class Ear:
         if hasattr(os, "register_at_fork"):
             os.register_at_fork(after_in_child=deaf)
         threading.Thread(target=self.watch, daemon=True).start()
-        atexit.register(ignore)  # called last, since it is registered first: then Python takes its handlers down
+        # called last, since it is registered first: then Python takes its handlers down
+        atexit.register(ignore)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if number != LATER:
             if self.raised:
                 return  # it is ending; `watch` sees to a second signal
-            self.raised, self.code = True, self.code or 128 + number  # `watch` may have heard it before
+            # `watch` may have heard it before
+            self.raised, self.code = True, self.code or 128 + number
         if not self.working:
             leave(self.code)  # all is written: Python's own end can take long
         if importing(frame) and LATER is not None:
-            signal.setitimer(signal.ITIMER_REAL, SOON)  # a module that is loaded in part is an error somewhere else
+            # a module that is loaded in part is an error somewhere else
+            signal.setitimer(signal.ITIMER_REAL, SOON)
         else:
             raise KeyboardInterrupt
 
     def unraisable(self, told: Any) -> None:
-        """An interruption that hit where Python drops exceptions (while it collects garbage, say) comes again."""
+        """An interruption that hit where Python drops exceptions (while it collects garbage, say)
+        comes again."""
         if isinstance(told.exc_value, KeyboardInterrupt) and LATER is not None:
             signal.setitimer(signal.ITIMER_REAL, SOON)
         else:
@@ -78,7 +87,9 @@ class Ear:
         """End the process `LIMIT` after the first signal, or at a second one."""
         begun = None
         while True:
-            self.woken.settimeout(None if begun is None else max(SOON, begun + LIMIT - time.monotonic()))
+            self.woken.settimeout(
+                None if begun is None else max(SOON, begun + LIMIT - time.monotonic())
+            )
             try:
                 ending = [number for number in self.woken.recv(64) if number in ENDING]
             except TimeoutError:
@@ -98,7 +109,9 @@ def deaf() -> None:
     signal.set_wakeup_fd(-1)
     for number in OURS:
         if isinstance(signal.getsignal(number), Ear):
-            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+            signal.signal(
+                number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+            )
 
 
 def ignore() -> None:
@@ -135,11 +148,13 @@ def stays(said: str) -> None:
 
 
 def leave(code: int) -> NoReturn:
-    """End this process and its children now: Python's own end waits for threads and for programs that run on a device."""
+    """End this process and its children now: Python's own end waits for threads and for programs
+    that run on a device."""
     flushing = threading.Thread(target=flush, daemon=True)
     flushing.start()
     flushing.join(0.5)  # for ever if nobody reads
-    children = getattr(sys.modules.get("multiprocessing"), "active_children", list)  # it may be imported in part
+    # it may be imported in part
+    children = getattr(sys.modules.get("multiprocessing"), "active_children", list)
     for child in children():
         child.kill()
     os._exit(code)
@@ -152,9 +167,11 @@ def flush() -> None:
 
 
 class Reader(io.RawIOBase):
-    """What reads our output; if it has gone, the process ends by SIGPIPE, as commands of the shell do.
+    """What reads our output; if it has gone, the process ends by SIGPIPE, as commands of the shell
+    do.
 
-    The signal itself stays ignored: it would also end us when a server or a process that we have started closes its end.
+    The signal itself stays ignored: it would also end us when a server or a process that we have
+    started closes its end.
     """
 
     def __init__(self, number: int):
@@ -182,12 +199,18 @@ def read_by(stream: TextIO | None) -> Any:
     """The same stream, to a `Reader`."""
     if stream is None or not hasattr(signal, "SIGPIPE"):
         return stream
-    return io.TextIOWrapper(io.BufferedWriter(Reader(stream.fileno())), stream.encoding, stream.errors, line_buffering=True)
+    return io.TextIOWrapper(
+        io.BufferedWriter(Reader(stream.fileno())),
+        stream.encoding,
+        stream.errors,
+        line_buffering=True,
+    )
 
 
 @contextlib.contextmanager
 def heard() -> Iterator[None]:
-    """What runs in it ends at a signal, with the exit code of that signal and without a traceback."""
+    """What runs in it ends at a signal, with the exit code of that signal and without a
+    traceback."""
     ear = Ear()
     ear.listen()
     sys.stdout, sys.stderr = read_by(sys.stdout), read_by(sys.stderr)
@@ -198,6 +221,8 @@ def heard() -> Iterator[None]:
     finally:
         ear.working = False
         if ear.code:
-            if not ear.told:  # typer ends in silence if it is interrupted while it reads the options
+            if (
+                not ear.told
+            ):  # typer ends in silence if it is interrupted while it reads the options
                 print("interrupted", file=sys.stderr)
             leave(ear.code)

@@ -14,28 +14,42 @@ from .options import Json, OtherTask
 
 def speed(
     preset: Annotated[
-        str | None, typer.Argument(help="A preset or a fit.json; by default the usual isometric task.")
+        str | None,
+        typer.Argument(help="A preset or a fit.json; by default the usual isometric task."),
     ] = None,
     task: OtherTask = None,
-    seeds: Annotated[int, typer.Option(min=1, help="How many recordings to simulate, each with its own noise.")] = 2048,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="How many recordings to simulate, each with its own noise.")
+    ] = 2048,
     duration: Annotated[float, typer.Option(help="Length of each recording in s.")] = 15.0,
-    precision: Annotated[Precision, typer.Option(help="Precision of the simulation.")] = Precision.single,
+    precision: Annotated[
+        Precision, typer.Option(help="Precision of the simulation.")
+    ] = Precision.single,
     threads: Threads = None,
     as_json: Json = False,
 ) -> None:
-    """How fast is this machine? Measure compile time, steps per second, real-time factor and memory.
+    """How fast is this machine? Measure compile time, steps per second, real-time factor and
+    memory.
 
-    It simulates as `jaxmuscle ensemble --reduce` does, but without the linear model beside it (control variate). The
-    real-time factor is simulated time over elapsed time. The numbers are medians of three calls.
+    It simulates as `jaxmuscle ensemble --reduce` does, but without the linear model beside it
+    (control variate). The real-time factor is simulated time over elapsed time. The numbers are
+    medians of three calls.
 
     Example:
 
         jaxmuscle speed --seeds 4096
     """
     with reporting(as_json):
-        os.environ["JAXMUSCLE_CACHE"] = "off"  # compile time is what it takes, not what loading takes
+        # compile time is what it takes, not what loading takes
+        os.environ["JAXMUSCLE_CACHE"] = "off"
         use(precision)
-        model = task_of(preset, task) if preset is not None else jm.Isometric() if task is None else jm.model.TASKS[task]()
+        model = (
+            task_of(preset, task)
+            if preset is not None
+            else jm.Isometric()
+            if task is None
+            else jm.model.TASKS[task]()
+        )
         found = jm.ensembles.measure(model, seeds, duration, threads)
         record(found)
         for name, value in found.items():

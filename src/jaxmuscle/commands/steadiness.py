@@ -21,15 +21,16 @@ def steadiness(
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """How steady is a force? Variability, power by band, regularity of one or several trials, without a model.
+    """How steady is a force? Variability, power by band, regularity of one or several trials,
+    without a model.
 
-    Give the trials of one person in one condition. Prints every value with its standard error and 95 % interval. From three
-    trials on, they follow from how much the trials differ.
-    Writes DIR/steadiness.json, DIR/steadiness.csv (a row per trial and quantity) and DIR/steadiness.png.
+    Give the trials of one person in one condition. Prints every value with its standard error and
+    95 % interval. From three trials on, they follow from how much the trials differ. Writes
+    DIR/steadiness.json, DIR/steadiness.csv (a row per trial and quantity) and DIR/steadiness.png.
 
     Example:
 
-        jaxmuscle steadiness trial1.csv trial2.csv trial3.csv --column force --rate 2048 --window 8:25
+        jaxmuscle steadiness trial1.csv trial2.csv --column force --rate 2048 --window 8:25
     """
     with reporting(as_json):
         from jaxmuscle._common.figures import write_figure
@@ -43,4 +44,7 @@ def steadiness(
         figures = write_figure(found.plot(), output, "steadiness", formats_of(formats))
         record(output / "steadiness.json")
         out.print(plain(found), highlight=False, soft_wrap=True)
-        out.print(f"Written: {output}/{', '.join(['steadiness.json', 'steadiness.csv', *figures])}", highlight=False)
+        out.print(
+            f"Written: {output}/{', '.join(['steadiness.json', 'steadiness.csv', *figures])}",
+            highlight=False,
+        )

@@ -8,36 +8,65 @@ import typer
 import jaxmuscle as jm
 
 from .console import CONVERGED, NOT_CONVERGED, err, out, plain, record, reporting, show, writable
-from .options import READING, Force, Formats, Json, NoiseName, Output, Seed, SpectrumName, Window, formats_of, names_in
+from .options import (
+    READING,
+    Force,
+    Formats,
+    Json,
+    NoiseName,
+    Output,
+    Seed,
+    SpectrumName,
+    Window,
+    formats_of,
+    names_in,
+)
 from .recordings import edges_of, reads_recordings
 
 
 @reads_recordings
 def study(
-    table: Annotated[Path, typer.Argument(help="Table of the recordings (.csv), or a .toml with the table and options.")],
+    table: Annotated[
+        Path,
+        typer.Argument(
+            help="Table of the recordings (.csv), or a .toml with the table and options."
+        ),
+    ],
     *,
     rung: Annotated[
         str | None,
         typer.Option(
-            help="Model for all people: 0 base, 1 with activation, 2 with tremor (default), 3 with a second resonance; or "
-            "auto: the one with the lowest AIC."
+            help=(
+                "Model for all people: 0 base, 1 with activation, 2 with tremor (default), 3 with a"
+                " second resonance; or "
+                "auto: the one with the lowest AIC."
+            )
         ),
     ] = None,
     noise: Annotated[
-        NoiseName | None, typer.Option(help="Colour of the noise on stiffness, band-limited by default.")
+        NoiseName | None,
+        typer.Option(help="Colour of the noise on stiffness, band-limited by default."),
     ] = None,
     window: Window = None,
     spectrum: Annotated[
-        SpectrumName | None, typer.Option(help="How spectra are estimated, as in `jaxmuscle analyse`; the same for all.")
+        SpectrumName | None,
+        typer.Option(
+            help="How spectra are estimated, as in `jaxmuscle analyse`; the same for all."
+        ),
     ] = None,
     quantities: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="Quantities that are compared; put commas between names.")
+        str | None,
+        typer.Option(
+            metavar="NAMES", help="Quantities that are compared; put commas between names."
+        ),
     ] = None,
     alpha: Annotated[
-        float | None, typer.Option(help="Level of the tests, 0.05 by default; intervals are those of 1 - alpha.")
+        float | None,
+        typer.Option(help="Level of the tests, 0.05 by default; intervals are those of 1 - alpha."),
     ] = None,
     correction: Annotated[
-        str | None, typer.Option(help="How p is corrected for many comparisons: holm (default), fdr or none.")
+        str | None,
+        typer.Option(help="How p is corrected for many comparisons: holm (default), fdr or none."),
     ] = None,
     seed: Seed = 0,
     output: Output = Path("out"),
@@ -46,12 +75,14 @@ def study(
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """Compare groups and conditions: fit all recordings of a study with one model, write tables, figures and methods.
+    """Compare groups and conditions: fit all recordings of a study with one model, write tables,
+    figures and methods.
 
-    The table has a line for each recording. It needs the columns file and person, and may have group, condition and trial.
-    The trials of a person in a condition are averaged. Options such as --column say how files are read. A column of the
-    same name in the table has priority. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png,
-    methods.txt and report.html, all at the end.
+    The table has a line for each recording. It needs the columns file and person, and may have
+    group, condition and trial. The trials of a person in a condition are averaged. Options such as
+    --column say how files are read. A column of the same name in the table has priority. Writes
+    DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png, methods.txt and
+    report.html, all at the end.
 
     Examples:
 

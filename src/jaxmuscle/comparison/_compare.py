@@ -15,7 +15,13 @@ from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.model._noises import NOISES, with_noise
-from jaxmuscle.model._parameters import HARMONIC, PARAMETERS, proper_names, proper_values, unknown_parameter
+from jaxmuscle.model._parameters import (
+    HARMONIC,
+    PARAMETERS,
+    proper_names,
+    proper_values,
+    unknown_parameter,
+)
 from jaxmuscle.model._rungs import RICHER, on_rung
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, planned
@@ -43,65 +49,80 @@ def compare_noise(
     key: Key = 0,
     progress: bool | Callable[[str, float], None] = False,
 ) -> Comparison:
-    """Fit a spectrum with every colour of noise, with and without harmonic, and say which can be told apart.
+    """Fit a spectrum with every colour of noise, with and without harmonic, and say which can be
+    told apart.
 
         print(jm.compare_noise(jm.task_for(target), target))
 
-    The richer models that a fit may climb to (`on_rung`) are compared, too, with the task's own noise: "activation",
-    "tremor" instead of the harmonic, "two resonances".
+    The richer models that a fit may climb to (`on_rung`) are compared, too, with the task's own
+    noise: "activation", "tremor" instead of the harmonic, "two resonances".
 
-    Each model is climbed, in linear response, to the highest of the maxima of its posterior from 64 starting points (16
-    without harmonic). For a model with a resonance ("tremor", "two resonances") a third of the searches begin, in the
-    parameters that both have, where that of a simpler model of the task's own noise ended, of several the one with the
-    lowest AIC. There
+    Each model is climbed, in linear response, to the highest of the maxima of its posterior from 64
+    starting points (16 without harmonic). For a model with a resonance ("tremor", "two resonances")
+    a third of the searches begin, in the parameters that both have, where that of a simpler model
+    of the task's own noise ended, of several the one with the lowest AIC. There
 
         AIC = -2 ln L + 2 p,    p = tr(F (F + Λ)⁻¹),
 
-    L the gamma-copula likelihood of the Welch bins with the total integrated out, F their Fisher information, Λ the prior's
-    precision; and the held-out score `Σ_k ln f(p_k | bins kept)`: the bins are left out in `groups` turns, every
-    `groups`-th at a time, and each is foretold by a fit to the rest. Two models are told apart if their AIC differs by at
-    least 6 and the held-out score says the same (docs/noise-colour.md); a harmonic whose frequency is free has to gain
-    6 + 2 ln(bins).
+    L the gamma-copula likelihood of the Welch bins with the total integrated out, F their Fisher
+    information, Λ the prior's precision; and the held-out score `Σ_k ln f(p_k | bins kept)`: the
+    bins are left out in `groups` turns, every `groups`-th at a time, and each is foretold by a fit
+    to the rest. Two models are told apart if their AIC differs by at least 6 and the held-out score
+    says the same (docs/noise-colour.md); a harmonic whose frequency is free has to gain 6 + 2
+    ln(bins).
 
     **Arguments:**
 
     - `task`: whose own noise keeps its values while the others take their defaults
     - `target`: what is fitted, as in `fit`
-    - `noises`: names of colours ("white", "band-limited", "ornstein-uhlenbeck", "pink") and of richer models ("activation",
-      "tremor", "two resonances"); by default all of them
-    - `free`, `fix`, `priors`, `bounds`: as in `fit`, those of a parameter that one model has and another has not for those
-      that have it
+    - `noises`: names of colours ("white", "band-limited", "ornstein-uhlenbeck", "pink") and of
+      richer models ("activation", "tremor", "two resonances"); by default all of them
+    - `free`, `fix`, `priors`, `bounds`: as in `fit`, those of a parameter that one model has and
+      another has not for those that have it
     - `groups`
-    - `key`: a `jax.random` key or a number; 8 of the starting points of each model are drawn with it, the others are always
-      the same
+    - `key`: a `jax.random` key or a number; 8 of the starting points of each model are drawn with
+      it, the others are always the same
     - `progress`: as in `fit`
 
-    **Returns:** a `Comparison`. A model that the task cannot carry is in its `left_out`, with the reason. With a sigma but
-    no segments there is no held-out score.
+    **Returns:** a `Comparison`. A model that the task cannot carry is in its `left_out`, with the
+    reason. With a sigma but no segments there is no held-out score.
 
-    **Raises:** `ValueError` if fewer than two models remain, for a target that states neither segments nor sigma, and as
-    `fit` does.
+    **Raises:** `ValueError` if fewer than two models remain, for a target that states neither
+    segments nor sigma, and as `fit` does.
 
-    **Source:** Akaike 1974, doi:10.1109/TAC.1974.1100705; Murata et al. 1994, doi:10.1109/72.329683; Vehtari, Gelman & Gabry
-    2017, doi:10.1007/s11222-016-9696-4.
+    **Source:** Akaike 1974, doi:10.1109/TAC.1974.1100705; Murata et al. 1994,
+    doi:10.1109/72.329683; Vehtari, Gelman & Gabry 2017, doi:10.1007/s11222-016-9696-4.
     """
     if not 2 <= groups <= len(target.bins):
-        raise ValueError(f"groups = {groups}: give a number from 2 to that of the target's bins, {len(target.bins)}")
+        raise ValueError(
+            f"groups = {groups}: give a number from 2 to that of the target's bins,"
+            f" {len(target.bins)}"
+        )
     with told(progress, f"comparing models on {target.name}") as tell, fitting():
         fixed = proper_values(fix)
         carried, left_out = _carried(task, noises, fixed)
-        problems = _setups(carried, target, free, fixed, proper_values(priors), proper_values(bounds), key)
+        problems = _setups(
+            carried, target, free, fixed, proper_values(priors), proper_values(bounds), key
+        )
         folds = None if target.segments is None else Folds.of([target], groups)
         found: dict[tuple[str, bool], dict[str, Any]] = {}
-        for number, (noise, problem) in enumerate(sorted(problems.items(), key=lambda item: RICHER.get(item[0], 0))):
+        for number, (noise, problem) in enumerate(
+            sorted(problems.items(), key=lambda item: RICHER.get(item[0], 0))
+        ):
             known = _poorer(noise, task, found)
-            for harmonic in (True, False) if float(problem.parts[0].task["harmonic_amplitude"]) > 0 else (False,):
+            for harmonic in (
+                (True, False)
+                if float(problem.parts[0].task["harmonic_amplitude"]) > 0
+                else (False,)
+            ):
                 what = f"{noise}, {'with' if harmonic else 'without'} harmonic"
                 tell(what, (number + 0.5 * (not harmonic)) / len(problems))
                 found[noise, harmonic] = _fitted(problem, folds, known, harmonic=harmonic)
     sought = any("harmonic_frequency" in problem.coordinates.names for problem in problems.values())
     needed = NEEDED + 2 * np.log(len(target.bins)) * sought
-    tasks, fitted = ({model: values.pop(name) for model, values in found.items()} for name in ("task", "fitted"))
+    tasks, fitted = (
+        {model: values.pop(name) for model, values in found.items()} for name in ("task", "fitted")
+    )
     seed = number_of(key)
     return Comparison(target, _rows(found), left_out, tasks, fitted, float(needed), groups, seed)
 
@@ -119,12 +140,16 @@ def _carried(
             if name in RICHER:
                 carried[name] = on_rung(task, RICHER[name])
             else:
-                carried[name] = task if type(task.noise) is NOISES[name] else with_noise(task, name, fix)
+                carried[name] = (
+                    task if type(task.noise) is NOISES[name] else with_noise(task, name, fix)
+                )
         except ValueError as error:
             left_out[name] = str(error)
     if len(carried) < 2:
         why = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
-        raise ValueError(f"noises: at least two are needed for a comparison, {len(carried)} can be used{why}")
+        raise ValueError(
+            f"noises: at least two are needed for a comparison, {len(carried)} can be used{why}"
+        )
     return carried, left_out
 
 
@@ -137,11 +162,17 @@ def _setups(
     bounds: dict[str, tuple[float, float]],
     key: Key,
 ) -> dict[str, FitProblem]:
-    """The fit of each noise; what concerns a parameter that only other noises have is left to them."""
+    """The fit of each noise; what concerns a parameter that only other noises have is left to
+    them."""
     everywhere = {name for task in carried.values() for name in task.parameter_names}
     everywhere |= {name for name in PARAMETERS if name.startswith("noise_")}
     chosen = proper_names(free)
-    for argument, names in (("free", chosen or ()), ("fix", fix), ("priors", priors), ("bounds", bounds)):
+    for argument, names in (
+        ("free", chosen or ()),
+        ("fix", fix),
+        ("priors", priors),
+        ("bounds", bounds),
+    ):
         for name in names:
             if name not in everywhere:
                 raise ValueError(f"{argument}: {unknown_parameter(name, everywhere)}")
@@ -149,7 +180,9 @@ def _setups(
     for noise, task in carried.items():
         own = set(task.parameter_names) - set(HARMONIC if RICHER.get(noise, 0) > 1 else ())
         names = None if chosen is None else [n for n in chosen if n in own]
-        options = FitOptions(free=names, fix=_of(fix, own), priors=_of(priors, own), bounds=_of(bounds, own), key=key)
+        options = FitOptions(
+            free=names, fix=_of(fix, own), priors=_of(priors, own), bounds=_of(bounds, own), key=key
+        )
         problems[noise] = planned(task, target, options).problem
     return problems
 
@@ -158,19 +191,31 @@ def _of(given: dict[str, Value], names: set[str]) -> dict[str, Value]:
     return {name: value for name, value in given.items() if name in names}
 
 
-def _poorer(noise: str, task: AbstractTask, found: Mapping[tuple[str, bool], dict[str, Any]]) -> dict[str, float] | None:
-    """Where the best of the poorer models of the same noise ended; None for a model that has no resonance."""
+def _poorer(
+    noise: str, task: AbstractTask, found: Mapping[tuple[str, bool], dict[str, Any]]
+) -> dict[str, float] | None:
+    """Where the best of the poorer models of the same noise ended; None for a model that has no
+    resonance."""
     rung = RICHER.get(noise, 0)
-    poorer = [values for (name, _), values in found.items()
-              if RICHER.get(name, 0) < rung and (name in RICHER or NOISES[name] is type(task.noise))]  # fmt: skip
+    poorer = [
+        values
+        for (name, _), values in found.items()
+        if RICHER.get(name, 0) < rung and (name in RICHER or NOISES[name] is type(task.noise))
+    ]
     if rung < RICHER["tremor"] or not poorer:
         return None
-    ended = min(poorer, key=lambda values: values["aic"] if np.isfinite(values["aic"]) else np.inf)["task"]
+    ended = min(poorer, key=lambda values: values["aic"] if np.isfinite(values["aic"]) else np.inf)[
+        "task"
+    ]
     return {name: float(ended[name]) for name in ended.parameter_names}
 
 
 def _fitted(
-    problem: FitProblem, folds: Folds | None, known: dict[str, float] | None = None, *, harmonic: bool
+    problem: FitProblem,
+    folds: Folds | None,
+    known: dict[str, float] | None = None,
+    *,
+    harmonic: bool,
 ) -> dict[str, Any]:
     """One model at its maximum, with its score."""
     model, target = Candidate.of(problem, harmonic=harmonic, known=known), problem.parts[0].target
@@ -178,7 +223,9 @@ def _fitted(
     bins = None if folds is None else masked_bins(target, np.ones((1, len(target.bins))))
     peak = maxima(model, model.starts[None], bins, moving)
     held = None if folds is None else held_out(model, peak.theta, folds, moving)
-    residual = standardised(target.proportional_power, peak.proportional[0], bin_statistics(target, peak.line[0]))
+    residual = standardised(
+        target.proportional_power, peak.proportional[0], bin_statistics(target, peak.line[0])
+    )
     (part,) = model.likelihood.objective.parts
     problem = problem if harmonic else without_harmonic(problem)
     objective = problem.linear([peak.line[0]])

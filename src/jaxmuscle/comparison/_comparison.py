@@ -1,4 +1,5 @@
-"""What a comparison of noises found: a row for each model, which of them can be told apart, in numbers and words."""
+"""What a comparison of noises found: a row for each model, which of them can be told apart, in
+numbers and words."""
 
 import json
 import math
@@ -31,15 +32,28 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 NEEDED = 6.0
-LEGEND = ("  line: with a harmonic. par: effective number of parameters. weight: Akaike weight. p: of the verdict. "
-          "held-out: score for bins left out, minus that of the first row, ± standard error")  # fmt: skip
-NUMBERS = ("log_likelihood", "parameters", "aic", "delta_aic", "weight", "score", "score_difference", "score_stderr",
-           "chi2_per_bin", "adequacy_p")  # fmt: skip
+LEGEND = (
+    "  line: with a harmonic. par: effective number of parameters. weight: Akaike weight. p: of the"
+    " verdict. held-out: score for bins left out, minus that of the first row, ± standard error"
+)
+NUMBERS = (
+    "log_likelihood",
+    "parameters",
+    "aic",
+    "delta_aic",
+    "weight",
+    "score",
+    "score_difference",
+    "score_stderr",
+    "chi2_per_bin",
+    "adequacy_p",
+)
 COLUMNS = ("noise", "harmonic", *NUMBERS, "adequate", "success")
 
 
 class Evidence(NamedTuple):
-    """What a decision looks at: a model's AIC, its score of every bin, if there is one, and whether its climbs settled."""
+    """What a decision looks at: a model's AIC, its score of every bin, if there is one, and whether
+    its climbs settled."""
 
     aic: float
     scores: Float[np.ndarray, " bins"] | None
@@ -49,9 +63,10 @@ class Evidence(NamedTuple):
 class Decision(Printed, Result, eqx.Module):
     """Model `a` against model `b`.
 
-    How much lower the AIC of `a` is (`aic_gain`), how much higher its held-out score (`score_gain`, `score_stderr`; None
-    if nothing was held out). The two are told apart if the AIC differs by at least `needed` and the held-out score, if there
-    is one, says the same. `unsettled` names those whose search did not come to its end: they are not compared.
+    How much lower the AIC of `a` is (`aic_gain`), how much higher its held-out score (`score_gain`,
+    `score_stderr`; None if nothing was held out). The two are told apart if the AIC differs by at
+    least `needed` and the held-out score, if there is one, says the same. `unsettled` names those
+    whose search did not come to its end: they are not compared.
     """
 
     a: str
@@ -78,7 +93,10 @@ class Decision(Printed, Result, eqx.Module):
         numbers = f"AIC lower by {abs(self.aic_gain):.1f}"
         if self.score_gain is not None:
             gain = self.score_gain if self.aic_gain >= 0 else -self.score_gain
-            numbers += f", held-out score {'higher' if gain >= 0 else 'lower'} by {abs(gain):.1f} ± {self.score_stderr:.1f}"
+            numbers += (
+                f", held-out score {'higher' if gain >= 0 else 'lower'} by {abs(gain):.1f} ±"
+                f" {self.score_stderr:.1f}"
+            )
         if self.winner is not None:
             return f"the data prefer {better} to {worse}: {numbers}"
         open_ = f"{better} and {worse} cannot be told apart"
@@ -86,7 +104,9 @@ class Decision(Printed, Result, eqx.Module):
             whose = " and of ".join(self.unsettled)
             return f"{better} and {worse} are not compared: the search of {whose} did not converge"
         apart = f"to tell them apart, the AIC must differ by {self.needed:.3g} or more"
-        apart += ", since chance alone would find some frequency that fits a little better" * (self.needed > NEEDED)
+        apart += ", since chance alone would find some frequency that fits a little better" * (
+            self.needed > NEEDED
+        )
         if abs(self.aic_gain) >= self.needed:
             return f"{open_}: AIC and held-out score disagree (for {better}: {numbers})"
         return f"{open_} (for {better}: {numbers}); {apart}"
@@ -101,7 +121,8 @@ def decided(names: tuple[str, str], a: Evidence, b: Evidence, needed: float = NE
 def score_difference(
     a: Float[np.ndarray, " bins"] | None, b: Float[np.ndarray, " bins"] | None
 ) -> tuple[float | None, float | None]:
-    """`Σ (a_k - b_k)` and its standard error √n sd(a_k - b_k) (Vehtari, Gelman & Gabry 2017, 10.1007/s11222-016-9696-4)."""
+    """`Σ (a_k - b_k)` and its standard error √n sd(a_k - b_k) (Vehtari, Gelman & Gabry 2017,
+    10.1007/s11222-016-9696-4)."""
     if a is None or b is None:
         return None, None
     difference = a - b
@@ -111,10 +132,11 @@ def score_difference(
 class ComparedModel(eqx.Module):
     """One model: a colour of noise or a richer model (`noise`), with or without harmonic.
 
-    `log_likelihood` at the maximum of the posterior, the offset integrated out; `parameters`, their effective number
-    p = tr(F (F + Λ)⁻¹); `aic` = -2 ln L + 2 p; `delta_aic` above the lowest; Akaike `weight`; `scores`, log density of every
-    bin foretold from the others, and `score`, their sum; `score_difference` to the model of lowest AIC with `score_stderr`
-    (None where the target has no segments); `chi2_per_bin`; `adequacy_p`, how often its own spectra would lie as far from
+    `log_likelihood` at the maximum of the posterior, the offset integrated out; `parameters`, their
+    effective number p = tr(F (F + Λ)⁻¹); `aic` = -2 ln L + 2 p; `delta_aic` above the lowest;
+    Akaike `weight`; `scores`, log density of every bin foretold from the others, and `score`, their
+    sum; `score_difference` to the model of lowest AIC with `score_stderr` (None where the target
+    has no segments); `chi2_per_bin`; `adequacy_p`, how often its own spectra would lie as far from
     their fit; `success`, whether its climbs settled.
     """
 
@@ -142,7 +164,8 @@ class ComparedModel(eqx.Module):
 
     @property
     def evidence(self) -> "Evidence":
-        """What decides between models: AIC, the score of every bin (or None), whether the search converged."""
+        """What decides between models: AIC, the score of every bin (or None), whether the search
+        converged."""
         return Evidence(self.aic, self.scores, self.success)
 
     @property
@@ -162,9 +185,10 @@ def lowest(rows: list[Row]) -> Row:
 class Comparison(Printed, Result, eqx.Module):
     """Which noise a spectrum speaks for.
 
-    `rows`, a `ComparedModel` each; `left_out` {noise: why the task cannot carry it}; `tasks` and `fitted` (proportional
-    power on the target's bins) by (noise, harmonic); `harmonic_needed`, by how much the AIC has to be lower with the
-    harmonic; `groups`, the number of turns in which bins were left out; `seed`; `versions`.
+    `rows`, a `ComparedModel` each; `left_out` {noise: why the task cannot carry it}; `tasks` and
+    `fitted` (proportional power on the target's bins) by (noise, harmonic); `harmonic_needed`, by
+    how much the AIC has to be lower with the harmonic; `groups`, the number of turns in which bins
+    were left out; `seed`; `versions`.
     """
 
     target: Target
@@ -194,11 +218,13 @@ class Comparison(Printed, Result, eqx.Module):
         return tuple(sorted(names, key=lambda name: self.of(name).aic))
 
     def of(self, noise: str) -> ComparedModel:
-        """The better one, by AIC, of a noise's models with and without harmonic. Raises `ValueError` for another noise."""
+        """The better one, by AIC, of a noise's models with and without harmonic. Raises
+        `ValueError` for another noise."""
         rows = [row for row in self.rows if row.noise == noise]
         if not rows:
             raise ValueError(
-                f"noise = {noise!r}: not compared; there are {', '.join(dict.fromkeys(r.noise for r in self.rows))}"
+                f"noise = {noise!r}: not compared; there are"
+                f" {', '.join(dict.fromkeys(r.noise for r in self.rows))}"
             )
         return lowest(rows)
 
@@ -208,13 +234,19 @@ class Comparison(Printed, Result, eqx.Module):
 
     @property
     def harmonic(self) -> Decision | None:
-        """Of noises that were fitted both ways the best with a harmonic against the best without; None if there is none."""
+        """Of noises that were fitted both ways the best with a harmonic against the best without;
+        None if there is none."""
         both = {row.noise for row in self.rows if row.harmonic}
-        sides = [[row for row in self.rows if row.harmonic == present and row.noise in both] for present in (True, False)]
+        sides = [
+            [row for row in self.rows if row.harmonic == present and row.noise in both]
+            for present in (True, False)
+        ]
         if not all(sides):
             return None
         names = ("a harmonic", "no harmonic")
-        return decided(names, lowest(sides[0]).evidence, lowest(sides[1]).evidence, self.harmonic_needed)
+        return decided(
+            names, lowest(sides[0]).evidence, lowest(sides[1]).evidence, self.harmonic_needed
+        )
 
     @property
     def verdict(self) -> tuple[str, ...]:
@@ -223,25 +255,41 @@ class Comparison(Printed, Result, eqx.Module):
         said = [str(self.between(first, other)) for other in others]
         if self.harmonic is not None:
             asked = any(row.harmonic for row in self.rows if row.noise == first)
-            said.append(str(self.harmonic) if asked else f"among the models without tremor, {self.harmonic}")
+            said.append(
+                str(self.harmonic) if asked else f"among the models without tremor, {self.harmonic}"
+            )
         if self.best.scores is None:
-            said.append("the target states no segments: nothing was held out, the AIC decides alone")
+            said.append(
+                "the target states no segments: nothing was held out, the AIC decides alone"
+            )
         return tuple(said)
 
     @property
     def adequate(self) -> str:
-        """Which models describe the data: that one is better than another does not say that it is good."""
+        """Which models describe the data: that one is better than another does not say that it is
+        good."""
         known = [row for row in self.rows if row.adequate is not None]
         fine = [row.label for row in known if row.adequate]
         if not known:
-            return "whether any model describes the data cannot be judged: the target states neither segments nor sigma"
+            return (
+                "whether any model describes the data cannot be judged: the target states neither"
+                " segments nor sigma"
+            )
         if not fine:
-            return "none of the models describes the data (p < 0.01 for each): do not believe the best of them either"
+            return (
+                "none of the models describes the data (p < 0.01 for each): do not believe the best"
+                " of them either"
+            )
         every = len(fine) == len(self.rows)
-        return "every model describes the data" if every else f"these describe the data (p >= 0.01): {'; '.join(fine)}"
+        return (
+            "every model describes the data"
+            if every
+            else f"these describe the data (p >= 0.01): {'; '.join(fine)}"
+        )
 
     def table(self) -> list[dict[str, Any]]:
-        """A row for each model, with the columns that *Results as numbers* lists (docs/reference/index.md)."""
+        """A row for each model, with the columns that *Results as numbers* lists
+        (docs/reference/index.md)."""
         return [{name: getattr(row, name) for name in COLUMNS} for row in self.rows]
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -249,7 +297,8 @@ class Comparison(Printed, Result, eqx.Module):
         return frame(self.table())
 
     def to_xarray(self) -> "xarray.Dataset":
-        """The numbers over (noise, harmonic), `fitted` and `scores` over frequency as well; NaN for what there is not."""
+        """The numbers over (noise, harmonic), `fitted` and `scores` over frequency as well; NaN for
+        what there is not."""
         import xarray
 
         names, present = list(dict.fromkeys(row.noise for row in self.rows)), [True, False]
@@ -257,11 +306,16 @@ class Comparison(Printed, Result, eqx.Module):
         empty = np.full(len(self.target.bins), np.nan)
 
         def grid(read: Any, missing: Any) -> list[list[Any]]:
-            values = [[read(found[n, h]) if (n, h) in found else None for h in present] for n in names]
+            values = [
+                [read(found[n, h]) if (n, h) in found else None for h in present] for n in names
+            ]
             return [[missing if value is None else value for value in row] for row in values]
 
         dims = ("noise", "harmonic")
-        numbers = {name: (dims, grid(lambda row, name=name: getattr(row, name), np.nan)) for name in NUMBERS}
+        numbers = {
+            name: (dims, grid(lambda row, name=name: getattr(row, name), np.nan))
+            for name in NUMBERS
+        }
         spectra = {
             "fitted": grid(lambda row: self.fitted[row.noise, row.harmonic], empty),
             "scores": grid(lambda row: row.scores, empty),
@@ -273,7 +327,11 @@ class Comparison(Printed, Result, eqx.Module):
                 "success": (dims, grid(lambda row: row.success, False)),
                 "target": ("frequency", self.target.proportional_power),
             },
-            coords={"noise": names, "harmonic": present, "frequency": ("frequency", self.target.frequency, {"units": "Hz"})},
+            coords={
+                "noise": names,
+                "harmonic": present,
+                "frequency": ("frequency", self.target.frequency, {"units": "Hz"}),
+            },
             attrs={"target_name": self.target.name, "verdict": "\n".join(self.verdict)}
             | {f"left_out_{name}": why for name, why in self.left_out.items()}
             | {f"version_{package}": number for package, number in self.versions.items()},
@@ -284,7 +342,9 @@ class Comparison(Printed, Result, eqx.Module):
         table = {
             "format": FORMAT,
             "target": self.target.name,
-            "rows": [{name: with_nulls(value) for name, value in row.items()} for row in self.table()],
+            "rows": [
+                {name: with_nulls(value) for name, value in row.items()} for row in self.table()
+            ],
             "adequate": self.adequate,
             "verdict": list(self.verdict),
             "left_out": self.left_out,
@@ -317,21 +377,36 @@ class Comparison(Printed, Result, eqx.Module):
 
     def __str__(self) -> str:
         kind = type(next(iter(self.tasks.values()))).__name__
-        head = f"  {'noise':<19}{'line':<5}{'ln L':>9}{'par':>5}{'ΔAIC':>9}{'weight':>7}{'p':>9}  held-out"
+        head = (
+            f"  {'noise':<19}{'line':<5}{'ln L':>9}{'par':>5}{'ΔAIC':>9}{'weight':>7}{'p':>9} "
+            " held-out"
+        )
         lines = [f"{self.target.name} ({self.target.provenance}), {kind}: which noise?", head]
         for row in sorted(self.rows, key=lambda row: row.aic):
-            held = "" if row.score is None else f"{_short(row.score_difference)} ± {_short(row.score_stderr)}"
-            p = row.adequacy_p
-            line = (
-                f"  {row.noise:<19}{'yes' if row.harmonic else 'no':<5}{_short(row.log_likelihood):>9}{row.parameters:>5.1f}"
+            held = (
+                ""
+                if row.score is None
+                else f"{_short(row.score_difference)} ± {_short(row.score_stderr)}"
             )
+            p = row.adequacy_p
+            line = f"  {row.noise:<19}{'yes' if row.harmonic else 'no':<5}"
+            line += f"{_short(row.log_likelihood):>9}{row.parameters:>5.1f}"
             line += f"{_short(row.delta_aic):>9}{row.weight:>7.2f}"
-            line += f"{'' if p is None else probability(p).removeprefix('p ').removeprefix('= '):>9}"
+            line += (
+                f"{'' if p is None else probability(p).removeprefix('p ').removeprefix('= '):>9}"
+            )
             lines.append(f"{line}  {held if row.success else 'failed'}")
         lines.append(LEGEND)
         if self.target.mean is not None:
-            lines.append("  The fit of these recordings also uses their mean force. So its p and AIC are a little different")
-        called = [f"{name} ({RUNGS[rung]})" for name, rung in RICHER.items() if any(row.noise == name for row in self.rows)]
+            lines.append(
+                "  The fit of these recordings also uses their mean force. So its p and AIC are a"
+                " little different"
+            )
+        called = [
+            f"{name} ({RUNGS[rung]})"
+            for name, rung in RICHER.items()
+            if any(row.noise == name for row in self.rows)
+        ]
         lines += [f"  the richer models that `fit` tries: {'; '.join(called)}"] * bool(called)
         said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]
         for sentence in (self.adequate, *self.verdict, *said):

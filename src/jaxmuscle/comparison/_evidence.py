@@ -1,4 +1,5 @@
-"""One model against one data set or many: highest maximum, effective parameters, and how well it foretells bins left out."""
+"""One model against one data set or many: highest maximum, effective parameters, and how well it
+foretells bins left out."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -29,8 +30,8 @@ SAME, KEPT = 1e-3, 16
 class Maxima(NamedTuple):
     """The highest maximum of every data set.
 
-    `log_likelihood` has the offset integrated out; `parameters` is the effective number; `line` the harmonic's share of the
-    power of each bin.
+    `log_likelihood` has the offset integrated out; `parameters` is the effective number; `line` the
+    harmonic's share of the power of each bin.
     """
 
     theta: Float[np.ndarray, "sets free"]
@@ -56,23 +57,34 @@ class Candidate(NamedTuple):
     starts: Float[np.ndarray, "starts free"]
 
     @classmethod
-    def of(cls, problem: FitProblem, *, harmonic: bool, known: Mapping[str, float] | None = None) -> "Candidate":
-        """Of a fit, or of the same without harmonic: amplitude zero, whatever the coordinates of amplitude and frequency.
+    def of(
+        cls, problem: FitProblem, *, harmonic: bool, known: Mapping[str, float] | None = None
+    ) -> "Candidate":
+        """Of a fit, or of the same without harmonic: amplitude zero, whatever the coordinates of
+        amplitude and frequency.
 
-        With `known` values, where a poorer model ended, there are as many starts again that begin from there: with a free
-        resonance the highest maximum is hard to find from the prior's centre.
+        With `known` values, where a poorer model ended, there are as many starts again that begin
+        from there: with a free resonance the highest maximum is hard to find from the prior's
+        centre.
 
-        The data then say nothing about these two, so that they stay at their prior's centre and count as no parameters; the
-        compiled programs are those of the model with harmonic.
+        The data then say nothing about these two, so that they stay at their prior's centre and
+        count as no parameters; the compiled programs are those of the model with harmonic.
         """
         rng = np.random.default_rng(np.asarray(jax.random.key_data(problem.key)).tolist())
         names = problem.coordinates.names
         scattered = 0.5 * rng.standard_normal((RANDOM, len(names)))
         problem = problem if harmonic else without_harmonic(problem)
-        wide = harmonic or bool(set(RESONANCE) & set(names))  # a frequency has a maximum at almost every peak
-        spread = problem.coordinates.theta(starting_points(problem, SPREAD if wide else PLAIN - RANDOM))
+        # a frequency has a maximum at almost every peak
+        wide = harmonic or bool(set(RESONANCE) & set(names))
+        spread = problem.coordinates.theta(
+            starting_points(problem, SPREAD if wide else PLAIN - RANDOM)
+        )
         about = points_about(problem, np.zeros(len(names))) if harmonic else spread[:0]
-        on = spread[:0] if known is None else problem.coordinates.theta(continued(problem, SPREAD + RANDOM, known))
+        on = (
+            spread[:0]
+            if known is None
+            else problem.coordinates.theta(continued(problem, SPREAD + RANDOM, known))
+        )
         starts = np.concatenate([about, spread, scattered, on])
         if not harmonic:
             starts[:, [n in HARMONIC for n in names]] = 0.0
@@ -87,7 +99,9 @@ def without_harmonic(problem: FitProblem) -> FitProblem:
         return dataclasses.replace(problem, parts=(dataclasses.replace(part, task=task),))
     centre = np.where(np.array(c.names) == "harmonic_amplitude", 0.0, c.centre)
     still = eqx.tree_at(lambda c: c.centre, c, centre)
-    return dataclasses.replace(problem, coordinates=still, parts=(dataclasses.replace(part, coordinates=still),))
+    return dataclasses.replace(
+        problem, coordinates=still, parts=(dataclasses.replace(part, coordinates=still),)
+    )
 
 
 def maxima(
@@ -96,11 +110,14 @@ def maxima(
     bins: Bins | None,
     moving: Float[np.ndarray, "sets free"],
 ) -> Maxima:
-    """A block of steps from every start, then on from those that stand at different heights to the highest maximum."""
+    """A block of steps from every start, then on from those that stand at different heights to the
+    highest maximum."""
     sets, count, free = starts.shape
     owner = np.repeat(np.arange(sets), count)
     peak = _climbed(model, starts.reshape(-1, free), bins, moving, owner)
-    on = np.concatenate([s * count + _different(cost) for s, cost in enumerate(peak.cost.reshape(sets, count))])
+    on = np.concatenate(
+        [s * count + _different(cost) for s, cost in enumerate(peak.cost.reshape(sets, count))]
+    )
     peak, settled = _highest(model, peak.theta[on], bins, moving, owner[on])
     (moments,) = expand(model.likelihood.objective, peak.theta).moments
     return Maxima(
@@ -127,7 +144,8 @@ def _highest(
     moving: np.ndarray,
     owner: Int[np.ndarray, " rows"],
 ) -> tuple[Maximum, Bool[np.ndarray, " sets"]]:
-    """The best row of every data set, once a block of steps improves it by less than `ENOUGH`; whether it came to that."""
+    """The best row of every data set, once a block of steps improves it by less than `ENOUGH`;
+    whether it came to that."""
     sets, theta = len(moving), theta.copy()
     best: list[Any] = [None] * sets
     cost, settled = np.full(sets, np.inf), np.zeros(sets, dtype=bool)
@@ -146,9 +164,13 @@ def _highest(
     return Maximum(*(np.concatenate(x) for x in zip(*best, strict=True))), settled
 
 
-def _climbed(model: Candidate, theta: np.ndarray, bins: Bins | None, moving: np.ndarray, owner: np.ndarray) -> Maximum:
+def _climbed(
+    model: Candidate, theta: np.ndarray, bins: Bins | None, moving: np.ndarray, owner: np.ndarray
+) -> Maximum:
     own = None if bins is None else (jax.tree.map(lambda x: np.asarray(x)[owner], bins),)
-    return maximise(model.likelihood, theta, model.precision, bins=own, moving=moving[owner], max_steps=BLOCK)
+    return maximise(
+        model.likelihood, theta, model.precision, bins=own, moving=moving[owner], max_steps=BLOCK
+    )
 
 
 def effective_numbers(
@@ -156,7 +178,8 @@ def effective_numbers(
     precision: Float[np.ndarray, " free"],
     moving: Float[np.ndarray, "sets free"],
 ) -> Float[np.ndarray, " sets"]:
-    """Effective numbers of parameters over the moving coordinates; `curvature` is that of θ and the offset, Λ included."""
+    """Effective numbers of parameters over the moving coordinates; `curvature` is that of θ and the
+    offset, Λ included."""
     found = []
     for whole, moves in zip(curvature, moving > 0, strict=True):
         both = without_offsets(whole, len(precision))[np.ix_(moves, moves)]
@@ -166,11 +189,16 @@ def effective_numbers(
 
 @kept
 def _marginals(likelihood: Likelihood, moments: Moments, bins: Bins | None) -> Any:
-    return jax.vmap(lambda m, b: likelihood.marginal((m,), None if b is None else (b,)))(moments, bins)
+    return jax.vmap(lambda m, b: likelihood.marginal((m,), None if b is None else (b,)))(
+        moments, bins
+    )
 
 
-def marginals(likelihood: Likelihood, moments: Moments, bins: Bins | None) -> Float[np.ndarray, " rows"]:
-    """Log likelihood of every row, the offset integrated out; in batches of one size, so that one program serves."""
+def marginals(
+    likelihood: Likelihood, moments: Moments, bins: Bins | None
+) -> Float[np.ndarray, " rows"]:
+    """Log likelihood of every row, the offset integrated out; in batches of one size, so that one
+    program serves."""
     rows = len(moments.mean)
     found = []
     for start in range(0, rows, BATCH):
@@ -181,7 +209,8 @@ def marginals(likelihood: Likelihood, moments: Moments, bins: Bins | None) -> Fl
 
 
 class Folds(NamedTuple):
-    """Data sets with bins left out: `kept` without group g, `more` without it but for bin k; `group` of every bin."""
+    """Data sets with bins left out: `kept` without group g, `more` without it but for bin k;
+    `group` of every bin."""
 
     kept: Bins
     more: Bins
@@ -189,19 +218,24 @@ class Folds(NamedTuple):
 
     @classmethod
     def of(cls, targets: list[Target], groups: int) -> "Folds":
-        """Every `groups`-th bin of each target is left out together; leading axes (targets, groups) and (targets, bins)."""
+        """Every `groups`-th bin of each target is left out together; leading axes (targets, groups)
+        and (targets, bins)."""
         group = np.arange(len(targets[0].bins)) % groups
         masks = (group != np.arange(groups)[:, None]).astype(float)
         masks = np.concatenate([masks, masks[group] + np.eye(len(group))])
         both = stacked([masked_bins(target, masks) for target in targets])
-        kept, more = (Bins(*(x[:, part] for x in both)) for part in (slice(groups), slice(groups, None)))
+        kept, more = (
+            Bins(*(x[:, part] for x in both)) for part in (slice(groups), slice(groups, None))
+        )
         return cls(kept, more, group)
 
 
 def masked_bins(target: Target, masks: Float[np.ndarray, "rows bins"]) -> Bins:
     """The target's bins once for every mask, 0 for what is left out."""
     if target.segments is None:
-        raise ValueError(f"{target.name}: states no segments, so the law of its bins is unknown; give segments")
+        raise ValueError(
+            f"{target.name}: states no segments, so the law of its bins is unknown; give segments"
+        )
     law = target_law(target)
     power, half = np.log(target.proportional_power), law.degrees / 2
     return stacked([Bins(power, half, *_precision(law.correlation, mask), mask) for mask in masks])
@@ -213,12 +247,18 @@ def stacked(bins: list[Bins]) -> Bins:
 
 
 def held_out(
-    model: Candidate, theta: Float[np.ndarray, "sets free"], folds: Folds, moving: Float[np.ndarray, "sets free"]
+    model: Candidate,
+    theta: Float[np.ndarray, "sets free"],
+    folds: Folds,
+    moving: Float[np.ndarray, "sets free"],
 ) -> HeldOut:
-    """`ln f(p_k | bins kept; θ of the fold) = ln f(p_k and bins kept) - ln f(bins kept)`, refitted from `theta`."""
+    """`ln f(p_k | bins kept; θ of the fold) = ln f(p_k and bins kept) - ln f(bins kept)`, refitted
+    from `theta`."""
     sets, groups = np.shape(folds.kept.logdet)
     owner = np.repeat(np.arange(sets), groups)
-    kept, more = (jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), b) for b in (folds.kept, folds.more))
+    kept, more = (
+        jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), b) for b in (folds.kept, folds.more)
+    )
     peak, settled = _highest(model, theta[owner], kept, moving[owner], np.arange(sets * groups))
     (moments,) = expand(model.likelihood.objective, peak.theta).moments
     row = (np.arange(sets)[:, None] * groups + folds.group).ravel()

@@ -1,4 +1,5 @@
-"""What was measured: targets (spectra to fit to) and recordings, with every format they are read from.
+"""What was measured: targets (spectra to fit to) and recordings, with every format they are read
+from.
 
 A file is checked here once; what leaves is a `Target` or a `Recording`.
 """

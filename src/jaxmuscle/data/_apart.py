@@ -1,7 +1,9 @@
-"""Files that are not text are read apart: in a process of its own, whose crash or hunger is one sentence here.
+"""Files that are not text are read apart: in a process of its own, whose crash or hunger is one
+sentence here.
 
-The libraries for such files are not safe from damaged ones: some end the process, some take all memory, some never end. The
-process gets limits of memory and time, and hands back lines of JSON and plain numbers; nothing is unpickled.
+The libraries for such files are not safe from damaged ones: some end the process, some take all
+memory, some never end. The process gets limits of memory and time, and hands back lines of JSON and
+plain numbers; nothing is unpickled.
 """
 
 import contextlib
@@ -32,33 +34,56 @@ from jaxmuscle.data._apart_child import main
 main(request)"""
 SECONDS, EACH = 60, 10  # for every file, and for each MiB of it
 LINE = 1 << 26  # bytes of the longest answer that is not samples
-ALONE = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}
+ALONE = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "HDF5_PLUGIN_PRELOAD": "::",
+}
 
 
 def read_apart(path: Path, kind: str, error: type[ValueError] = ValueError, **words: str) -> Any:
-    """The channels of the file at `path`, or the text that it is made of, read as `kind` in a process of its own.
+    """The channels of the file at `path`, or the text that it is made of, read as `kind` in a
+    process of its own.
 
     **Arguments:** `words`, as in `looked_at`.
 
     **Returns:** a list of `Channel`s, or bytes.
 
-    **Raises:** `error` naming the file, also where that process crashes, needs too much memory or time; `ImportError` that
-    says what to install.
+    **Raises:** `error` naming the file, also where that process crashes, needs too much memory or
+    time; `ImportError` that says what to install.
     """
     size = looked_at(path, error, **words)
     if size == 0:
         raise error(f"{path}: is empty")
     seconds = SECONDS + EACH * math.ceil(size / 2**20)
     paths = [entry for entry in sys.path if isinstance(entry, str)]
-    request = {"path": str(path.absolute()), "kind": kind, "most": most(), "seconds": seconds, "paths": paths}
+    request = {
+        "path": str(path.absolute()),
+        "kind": kind,
+        "most": most(),
+        "seconds": seconds,
+        "paths": paths,
+    }
     with _reading(request, error) as (process, late):
-        return understood(path, kind, process.stdout, lambda: _ended(process.wait(), seconds, late=late.is_set()), error)
+        return understood(
+            path,
+            kind,
+            process.stdout,
+            lambda: _ended(process.wait(), seconds, late=late.is_set()),
+            error,
+        )
 
 
 def understood(
-    path: Path, kind: str, stream: io.BufferedIOBase, ended: Callable[[], str], error: type[ValueError] = ValueError
+    path: Path,
+    kind: str,
+    stream: io.BufferedIOBase,
+    ended: Callable[[], str],
+    error: type[ValueError] = ValueError,
 ) -> Any:
-    """What the process that reads the file at `path` hands over by `stream`; `ended` says why it ended before.
+    """What the process that reads the file at `path` hands over by `stream`; `ended` says why it
+    ended before.
 
     **Raises:** as `read_apart`.
     """
@@ -73,7 +98,9 @@ def understood(
 
 
 @contextlib.contextmanager
-def _reading(request: dict[str, Any], error: type[ValueError]) -> Iterator[tuple[Any, threading.Event]]:
+def _reading(
+    request: dict[str, Any], error: type[ValueError]
+) -> Iterator[tuple[Any, threading.Event]]:
     """The process that reads, which is gone at the end, and whether it has taken too long."""
     command = [multiprocessing.spawn.get_executable(), "-B", "-P", "-c", BEGIN]
     try:
@@ -86,7 +113,9 @@ def _reading(request: dict[str, Any], error: type[ValueError]) -> Iterator[tuple
             creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # of Windows
         )
     except OSError as reason:
-        raise error(f"{request['path']}: cannot be read: no process can be started for it: {reason}") from None
+        raise error(
+            f"{request['path']}: cannot be read: no process can be started for it: {reason}"
+        ) from None
     late = threading.Event()
 
     def stop() -> None:
@@ -97,7 +126,8 @@ def _reading(request: dict[str, Any], error: type[ValueError]) -> Iterator[tuple
     clock.daemon = True
     clock.start()
     try:
-        with contextlib.suppress(BrokenPipeError):  # it has ended already, which is seen when it is asked for the answer
+        # it has ended already, which is seen when it is asked for the answer
+        with contextlib.suppress(BrokenPipeError):
             process.stdin.write(json.dumps(request).encode() + b"\n")
             process.stdin.close()
         yield process, late
@@ -111,8 +141,8 @@ def _reading(request: dict[str, Any], error: type[ValueError]) -> Iterator[tuple
 def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes:
     """What the process hands over; not trusted, since the file may have taken it over.
 
-    **Raises:** `EOFError` where it ends before it has said all; `ValueError` with the words for what is wrong with the file;
-    `ImportError`.
+    **Raises:** `EOFError` where it ends before it has said all; `ValueError` with the words for
+    what is wrong with the file; `ImportError`.
     """
     line = stream.readline(LINE)
     if not line.endswith(b"\n"):
@@ -124,7 +154,9 @@ def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes:
         if size is not None and (not isinstance(size, int) or size < 0):
             raise TypeError
         described = [_described(*entry) for entry in head.get("channels", ())]
-        total = (size or 0) + sum(np.dtype(kind).itemsize * count for _, kind, count, _, _ in described)
+        total = (size or 0) + sum(
+            np.dtype(kind).itemsize * count for _, kind, count, _, _ in described
+        )
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         raise ValueError("it is damaged, and the answer of its reader makes no sense") from None
     if missing is not None:
@@ -132,19 +164,33 @@ def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes:
     if wrong is not None:
         raise ValueError(str(wrong))
     if large or total > allowed:
-        raise ValueError(f"it holds more than {allowed / 2**30:.3g} GiB, or says so because it is damaged{BEYOND}")
+        raise ValueError(
+            f"it holds more than {allowed / 2**30:.3g} GiB, or says so because it is"
+            f" damaged{BEYOND}"
+        )
     if size is not None:
         return _filled(stream, np.empty(size, np.uint8)).tobytes()
     if not described:
         raise ValueError("holds no channels with numbers")
-    return [Channel(name, _filled(stream, np.empty(count, kind)), rate, unit) for name, kind, count, rate, unit in described]
+    return [
+        Channel(name, _filled(stream, np.empty(count, kind)), rate, unit)
+        for name, kind, count, rate, unit in described
+    ]
 
 
-def _described(name: Any, kind: Any, count: Any, rate: Any, unit: Any) -> tuple[str, str, int, float | None, str]:
+def _described(
+    name: Any, kind: Any, count: Any, rate: Any, unit: Any
+) -> tuple[str, str, int, float | None, str]:
     if kind not in TYPES or not isinstance(count, int) or count < 0:
         raise TypeError
     stated = math.nan if rate is None else float(rate)
-    return printable(str(name)), kind, count, stated if 0 < stated < math.inf else None, printable(str(unit))
+    return (
+        printable(str(name)),
+        kind,
+        count,
+        stated if 0 < stated < math.inf else None,
+        printable(str(unit)),
+    )
 
 
 def _filled(stream: io.BufferedIOBase, array: np.ndarray) -> np.ndarray:
@@ -161,7 +207,13 @@ def _filled(stream: io.BufferedIOBase, array: np.ndarray) -> np.ndarray:
 def _ended(code: int, seconds: int, *, late: bool) -> str:
     """Why the process that reads ended without an answer."""
     if late or code == -getattr(signal, "SIGXCPU", 0):
-        return f"its reader did not come to an end within {seconds} s; the file is damaged, or made to do this"
+        return (
+            f"its reader did not come to an end within {seconds} s; the file is damaged, or made to"
+            " do this"
+        )
     if code < 0:
         return f"its reader crashed ({signal.Signals(-code).name}); the file is damaged"
-    return f"its reader ended without an answer (exit code {code}); the file is damaged, or Python cannot be started"
+    return (
+        f"its reader ended without an answer (exit code {code}); the file is damaged, or Python"
+        " cannot be started"
+    )

@@ -1,6 +1,8 @@
-"""The process that reads one file that is not text, for `_apart`: within limits, and nothing that it holds is run.
+"""The process that reads one file that is not text, for `_apart`: within limits, and nothing that
+it holds is run.
 
-It imports NumPy and the library for the format. Whatever that library does (crash, wait, take all memory), it does here.
+It imports NumPy and the library for the format. Whatever that library does (crash, wait, take all
+memory), it does here.
 """
 
 import io
@@ -27,7 +29,11 @@ def read_tar(path: str, most: int) -> bytes:
     try:
         with tarfile.open(path, "r:") as archive:
             for member in archive:
-                content = archive.extractfile(member) if member.name.split("/")[-1] == "wpd.json" else None
+                content = (
+                    archive.extractfile(member)
+                    if member.name.split("/")[-1] == "wpd.json"
+                    else None
+                )
                 if content is not None and member.size > most:
                     raise TooLarge
                 if content is not None:
@@ -38,13 +44,23 @@ def read_tar(path: str, most: int) -> bytes:
 
 
 READERS: dict[str, Callable[[str, int], list[Channel] | bytes]] = {
-    ".xlsx": read_xlsx, ".mat": read_mat, ".npy": read_npy, ".npz": read_npz, ".c3d": read_c3d, ".edf": read_edf,
-    ".bdf": read_edf, ".tdms": read_tdms, ".acq": read_acq, ".smr": read_smr, ".tar": read_tar,
-}  # fmt: skip
+    ".xlsx": read_xlsx,
+    ".mat": read_mat,
+    ".npy": read_npy,
+    ".npz": read_npz,
+    ".c3d": read_c3d,
+    ".edf": read_edf,
+    ".bdf": read_edf,
+    ".tdms": read_tdms,
+    ".acq": read_acq,
+    ".smr": read_smr,
+    ".tar": read_tar,
+}
 
 
 def main(request: dict[str, Any]) -> None:
-    """Answer on the standard output, which the libraries do not get: what they print there is lost."""
+    """Answer on the standard output, which the libraries do not get: what they print there is
+    lost."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     with os.fdopen(os.dup(1), "wb") as out:
         os.dup2(2, 1)
@@ -53,13 +69,18 @@ def main(request: dict[str, Any]) -> None:
 
 
 def limit(most: int, seconds: int) -> None:
-    """Limits of memory and processor time, none of files written and of core dumps; Windows has no such limits."""
+    """Limits of memory and processor time, none of files written and of core dumps; Windows has no
+    such limits."""
     try:
         import resource
     except ImportError:
         return
-    wanted = {resource.RLIMIT_AS: LIBRARIES + COPIES * most, resource.RLIMIT_CPU: seconds, resource.RLIMIT_CORE: 0,
-              resource.RLIMIT_FSIZE: 0}  # fmt: skip
+    wanted = {
+        resource.RLIMIT_AS: LIBRARIES + COPIES * most,
+        resource.RLIMIT_CPU: seconds,
+        resource.RLIMIT_CORE: 0,
+        resource.RLIMIT_FSIZE: 0,
+    }
     for kind, value in wanted.items():
         highest = resource.getrlimit(kind)[1]
         value = value if highest == resource.RLIM_INFINITY else min(value, highest)
@@ -70,7 +91,8 @@ def limit(most: int, seconds: int) -> None:
 
 
 def answer(request: dict[str, Any], out: io.BufferedIOBase) -> None:
-    """One line of JSON that says what follows, or what is wrong; then the bytes of the text, or of all samples."""
+    """One line of JSON that says what follows, or what is wrong; then the bytes of the text, or of
+    all samples."""
     head: dict[str, Any]
     parts: Iterator[Any] = iter(())
     try:
@@ -78,7 +100,9 @@ def answer(request: dict[str, Any], out: io.BufferedIOBase) -> None:
         if isinstance(found, bytes):
             head, parts, size = {"text": len(found)}, iter((found,)), len(found)
         else:
-            channels = [channel._replace(samples=_plain(channel.samples)) for channel in distinct(found)]
+            channels = [
+                channel._replace(samples=_plain(channel.samples)) for channel in distinct(found)
+            ]
             head = {"channels": [_described(channel) for channel in channels]}
             parts, size = map(_bytes, channels), sum(c.samples.nbytes for c in channels)
         if size > request["most"]:
@@ -109,4 +133,8 @@ def _described(channel: Channel) -> list[Any]:
 
 
 def _bytes(channel: Channel) -> memoryview:
-    return np.ascontiguousarray(channel.samples).data.cast("B") if channel.samples.size else memoryview(b"")
+    return (
+        np.ascontiguousarray(channel.samples).data.cast("B")
+        if channel.samples.size
+        else memoryview(b"")
+    )

@@ -1,4 +1,5 @@
-"""Whatever a fit may be given as its data, made a target: spectra, recordings, names and paths of both."""
+"""Whatever a fit may be given as its data, made a target: spectra, recordings, names and paths of
+both."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -33,18 +34,26 @@ def as_target(
 
         target = jm.data.as_target("vastus-lateralis-26mvc")
 
-    `given`: a `Target` is taken as it is. A `Recording`, `Trials` or several recordings of one condition give theirs
-    (`Trials.target`), in the windows that they have; a `PerturbedRecording` gives its own, and a `FrequencyResponse` one
-    without a spectrum. The path of a recording, or several of trials, is read, and the steady part of each found
-    (`Recording.steady`). The path of a frequency response is read by `load_frequency_response`. Another path, or the name
-    of a bundled target, is read as a spectrum.
+    `given`: a `Target` is taken as it is. A `Recording`, `Trials` or several recordings of one
+    condition give theirs (`Trials.target`), in the windows that they have; a `PerturbedRecording`
+    gives its own, and a `FrequencyResponse` one without a spectrum. The path of a recording, or
+    several of trials, is read, and the steady part of each found (`Recording.steady`). The path of
+    a frequency response is read by `load_frequency_response`. Another path, or the name of a
+    bundled target, is read as a spectrum.
 
-    **Arguments:** `quantity`, `segments`, `dataset`, `axis`, how a spectrum is read, as in `load_target`; `segments`,
-    `lever_arm`, how a frequency response is read, as in `load_frequency_response`.
+    **Arguments:** `quantity`, `segments`, `dataset`, `axis`, how a spectrum is read, as in
+    `load_target`; `segments`, `lever_arm`, how a frequency response is read, as in
+    `load_frequency_response`.
 
     **Raises:** `TargetError`, a `ValueError`, for anything else, with the remedy.
     """
-    asked = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": axis, "lever_arm": lever_arm}
+    asked = {
+        "quantity": quantity,
+        "segments": segments,
+        "dataset": dataset,
+        "axis": axis,
+        "lever_arm": lever_arm,
+    }
     options = {name: value for name, value in asked.items() if value is not None}
     if isinstance(given, Target):
         _check_options(options, (), "a target")
@@ -80,21 +89,29 @@ def _check_options(options: Mapping[str, Any], known: tuple[str, ...], what: str
 
 def _remedy(given: Any) -> str:
     what = f"target: this is of type {type(given).__name__}; give"
-    usual = "a Target, the name of a bundled one, a Recording, a list of the recordings of one condition, or their paths"
+    usual = (
+        "a Target, the name of a bundled one, a Recording, a list of the recordings of one"
+        " condition, or their paths"
+    )
     if hasattr(given, "columns") and hasattr(given, "index"):
         return f"{what} a recording made of it: jaxmuscle.Recording.from_dataframe(...)"
     if hasattr(given, "shape"):
-        return (f"target: an array of shape {given.shape} does not say what it is. Samples of a force: give "
-                "jaxmuscle.Recording(samples, rate). Powers of a spectrum: give jaxmuscle.Target(name, power, "
-                "segments=...)")  # fmt: skip
+        return (
+            f"target: an array of shape {given.shape} does not say what it is. Samples of a force:"
+            " give jaxmuscle.Recording(samples, rate). Powers of a spectrum: give"
+            " jaxmuscle.Target(name, power, segments=...)"
+        )
     if isinstance(given, Sequence) and len(given) > 0:
-        return ("target: a list holds the recordings of one condition, or their paths; spectra of several people are "
-                "fitted by fit_cohort, those of one person by fit_joint")  # fmt: skip
+        return (
+            "target: a list holds the recordings of one condition, or their paths; spectra of"
+            " several people are fitted by fit_cohort, those of one person by fit_joint"
+        )
     return f"{what} {usual}"
 
 
 def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Whether the file at `path` holds a recording rather than a spectrum: by its ending, a text by its header and rows.
+    """Whether the file at `path` holds a recording rather than a spectrum: by its ending, a text by
+    its header and rows.
 
         jm.data.is_recording("trial.csv")
 
@@ -111,8 +128,15 @@ def is_recording(path: str | os.PathLike[str]) -> bool:
         return False
     if all(is_number(name, delimiter) for name in names):
         return len(rows) > (POINTS if kind == ".csv" else ROWS)
-    spectral = any(name.startswith(("freq", "proportional", "power")) or name in ("f", "hz") for name in names)
-    if kind != ".csv":  # above the columns of a laboratory's text may stand a line "Frequency: 1000"
-        return not (spectral and len(names) > 1 and all(is_number(cell, delimiter) for cell in cells_of(rows[1], delimiter)))
+    spectral = any(
+        name.startswith(("freq", "proportional", "power")) or name in ("f", "hz") for name in names
+    )
+    # above the columns of a laboratory's text may stand a line "Frequency: 1000"
+    if kind != ".csv":
+        return not (
+            spectral
+            and len(names) > 1
+            and all(is_number(cell, delimiter) for cell in cells_of(rows[1], delimiter))
+        )
     figure = len(rows) > 1 and set(map(str.casefold, cells_of(rows[1], delimiter))) == {"x", "y"}
     return not spectral and not figure and len(rows) > ROWS

@@ -1,8 +1,9 @@
-"""Figures digitised with WebPlotDigitizer: its project (.json, .tar) or its CSV of several datasets, as columns.
+"""Figures digitised with WebPlotDigitizer: its project (.json, .tar) or its CSV of several
+datasets, as columns.
 
-A project keeps pixels and four calibration points; data follow from them as in WebPlotDigitizer itself, which
-ignores the stored values too: (x, y) = A (px, py) + c with A mapping the pixel steps X1 → X2 and Y1 → Y2 to the steps
-of the axis values, in log10 on a logarithmic axis.
+A project keeps pixels and four calibration points; data follow from them as in WebPlotDigitizer
+itself, which ignores the stored values too: (x, y) = A (px, py) + c with A mapping the pixel steps
+X1 → X2 and Y1 → Y2 to the steps of the axis values, in log10 on a logarithmic axis.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -45,23 +46,33 @@ def read_project(text: str, file: str, dataset: str | None) -> Points:
     project = parsed(text, file, "JSON", TargetError)
     axes, datasets = _collections(project, file)
     names = [str(_get(entry, "name", str, file)) for entry in datasets]
-    filled = [i for i, entry in enumerate(datasets) if _get(entry, "data", list, f"{file}, dataset {names[i]!r}")]
+    filled = [
+        i
+        for i, entry in enumerate(datasets)
+        if _get(entry, "data", list, f"{file}, dataset {names[i]!r}")
+    ]
     chosen = datasets[_choose(dataset, names, filled, file)]
     name, axes_name = str(chosen["name"]), chosen.get("axesName")
     where = f"{file}, dataset {name!r}"
     found = [entry for entry in axes if isinstance(entry, dict) and entry.get("name") == axes_name]
     if len(found) != 1:
         problem = f"{where}: belongs to axes {axes_name!r}, of which the project has {len(found)}"
-        raise TargetError(f"{problem}; choose the axes of the dataset in WebPlotDigitizer and save again")
+        raise TargetError(
+            f"{problem}; choose the axes of the dataset in WebPlotDigitizer and save again"
+        )
     places = tuple(f"dataset {name!r}, point {i}" for i in range(1, len(chosen["data"]) + 1))
-    pixels = [[_number(p, key, f"{file}, {at}") for key in ("x", "y")] for p, at in zip(chosen["data"], places, strict=True)]
+    pixels = [
+        [_number(p, key, f"{file}, {at}") for key in ("x", "y")]
+        for p, at in zip(chosen["data"], places, strict=True)
+    ]
     matrix, offset, logs = _calibration(found[0], f"{file}, axes {axes_name!r}")
     x, y = matrix @ np.array(pixels).T + offset[:, None]
     return Points(x, y, places, *logs, name)
 
 
 def read_datasets(text: str, file: str, dataset: str | None) -> Points | None:
-    """The points of one dataset of the CSV that "Export All Data" writes; `None` if the text is no such CSV.
+    """The points of one dataset of the CSV that "Export All Data" writes; `None` if the text is no
+    such CSV.
 
     Names stand in the first line, each over two columns X, Y; shorter datasets end in empty cells.
 
@@ -78,7 +89,9 @@ def read_datasets(text: str, file: str, dataset: str | None) -> Points | None:
     header += [""] * (len(labels) - len(header))
     if len(header) > len(labels):
         problem = f"{file}, {lines[0][0]}: {len(header)} cells above {len(labels)} columns"
-        raise TargetError(f"{problem}; a comma in a dataset's name does this: rename it and export again")
+        raise TargetError(
+            f"{problem}; a comma in a dataset's name does this: rename it and export again"
+        )
     places = [place for place, _ in lines[2:]]
     parts = [_part(rows, places, start, delimiter, file) for start in starts]
     names = [header[start] for start in starts]
@@ -88,13 +101,16 @@ def read_datasets(text: str, file: str, dataset: str | None) -> Points | None:
 
 
 def columns_of(points: Points, axis: str, file: str) -> tuple[Columns, bool]:
-    """Frequency [Hz] and power of the points, unsorted, and whether the frequency axis is logarithmic.
+    """Frequency [Hz] and power of the points, unsorted, and whether the frequency axis is
+    logarithmic.
 
     **Raises:** `TargetError` naming file and point.
     """
     if axis == "log-log":
         if points.log_x or points.log_y:
-            raise TargetError(f"{file}: is calibrated with a logarithmic axis already; leave axis='log-log' out")
+            raise TargetError(
+                f"{file}: is calibrated with a logarithmic axis already; leave axis='log-log' out"
+            )
         points = points._replace(log_x=True, log_y=True)
     columns = [_power_of_ten(points, "x", file) if points.log_x else points.x]
     columns.append(_power_of_ten(points, "y", file) if points.log_y else points.y)
@@ -113,7 +129,10 @@ def _power_of_ten(points: Points, name: str, file: str) -> Float[np.ndarray, " p
     wrong = np.flatnonzero(~(np.abs(exponents) <= 100))
     if wrong.size:
         what, value = "frequency" if name == "x" else "power", exponents[wrong[0]]
-        raise TargetError(f"{file}, {points.places[wrong[0]]}: log10 of the {what} is {value:g}; expected -100 to 100")
+        raise TargetError(
+            f"{file}, {points.places[wrong[0]]}: log10 of the {what} is {value:g}; expected -100"
+            " to 100"
+        )
     return 10.0**exponents
 
 
@@ -123,13 +142,19 @@ def _choose(dataset: str | None, names: list[str], filled: list[int], file: str)
         if len(filled) == 1:
             return filled[0]
         if not filled:
-            raise TargetError(f"{file}: holds no points; add points in WebPlotDigitizer and save again")
+            raise TargetError(
+                f"{file}: holds no points; add points in WebPlotDigitizer and save again"
+            )
         known = ", ".join(repr(names[i]) for i in filled)
-        raise TargetError(f"{file}: holds several datasets, choose one with dataset= (--dataset): {known}")
+        raise TargetError(
+            f"{file}: holds several datasets, choose one with dataset= (--dataset): {known}"
+        )
     if dataset not in names:
         raise TargetError(f"{file}: no dataset {dataset!r}; {choices(dataset, names)}")
     if names.count(dataset) > 1:
-        raise TargetError(f"{file}: {names.count(dataset)} datasets are called {dataset!r}; rename them")
+        raise TargetError(
+            f"{file}: {names.count(dataset)} datasets are called {dataset!r}; rename them"
+        )
     if names.index(dataset) not in filled:
         raise TargetError(f"{file}: dataset {dataset!r} holds no points")
     return names.index(dataset)
@@ -143,11 +168,16 @@ def _collections(project: Any, file: str) -> tuple[list[Any], list[Any]]:
         parameters = _get(old, "axesParameters", dict, file)
         kind, points = old.get("axesType"), _get(old, "calibration", list, file)
         axes = {**parameters, "name": "XY", "type": kind, "calibrationPoints": points}
-        datasets = [{**_table(entry, file), "axesName": "XY"} for entry in _get(old, "dataSeries", list, file)]
+        datasets = [
+            {**_table(entry, file), "axesName": "XY"}
+            for entry in _get(old, "dataSeries", list, file)
+        ]
         return [axes], datasets
     if isinstance(project, dict) and "target_table" in project:
-        raise TargetError(f"{file}: is the result of a fit, and a spectrum is needed. `jaxmuscle compare` takes the "
-                          "spectrum of a fit.json; else give the file that was fitted")  # fmt: skip
+        raise TargetError(
+            f"{file}: is the result of a fit, and a spectrum is needed. `jaxmuscle compare` takes"
+            " the spectrum of a fit.json; else give the file that was fitted"
+        )
     if not isinstance(project, dict) or "axesColl" not in project:
         raise TargetError(f"{file}: is not a WebPlotDigitizer project (it has no axesColl)")
     _check_version(project, 4, file)
@@ -158,7 +188,9 @@ def _collections(project: Any, file: str) -> tuple[list[Any], list[Any]]:
 def _check_version(table: dict[str, Any], major: int, file: str) -> None:
     version = table.get("version")
     if not isinstance(version, list) or version[:1] != [major]:
-        raise TargetError(f"{file}: project version {version!r} is not known (3 and 4 are); {EXPORT}")
+        raise TargetError(
+            f"{file}: project version {version!r} is not known (3 and 4 are); {EXPORT}"
+        )
 
 
 def _calibration(
@@ -166,21 +198,33 @@ def _calibration(
 ) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, " 2"], tuple[bool, bool]]:
     """Matrix and offset from pixels to axis values, and which of the axes (x, y) are in log10."""
     if axes.get("type") != "XYAxes":
-        raise TargetError(f"{where}: of type {axes.get('type')!r}; calibrate the figure as '2D (X-Y) Plot'")
+        raise TargetError(
+            f"{where}: of type {axes.get('type')!r}; calibrate the figure as '2D (X-Y) Plot'"
+        )
     points = _get(axes, "calibrationPoints", list, where)
     if len(points) != 4:
-        raise TargetError(f"{where}: {len(points)} calibration points, 4 are needed (X1, X2, Y1, Y2)")
+        raise TargetError(
+            f"{where}: {len(points)} calibration points, 4 are needed (X1, X2, Y1, Y2)"
+        )
     logs = (axes.get("isLogX") is True, axes.get("isLogY") is True)
-    named = list(zip(points, ("X1", "X2", "Y1", "Y2"), ("dx", "dx", "dy", "dy"), (0, 0, 1, 1), strict=True))
-    X1, X2, Y1, Y2 = (np.array([_number(p, k, f"{where}, {at}") for k in ("px", "py")]) for p, at, _, _ in named)
+    named = list(
+        zip(points, ("X1", "X2", "Y1", "Y2"), ("dx", "dx", "dy", "dy"), (0, 0, 1, 1), strict=True)
+    )
+    X1, X2, Y1, Y2 = (
+        np.array([_number(p, k, f"{where}, {at}") for k in ("px", "py")]) for p, at, _, _ in named
+    )
     x1, x2, y1, y2 = (_axis_value(p, key, logs[i], f"{where}, {at}") for p, at, key, i in named)
     steps = np.stack([X2 - X1, Y2 - Y1], axis=1)
     values = np.array([x2 - x1, y2 - y1])
     if np.any(values == 0):
-        raise TargetError(f"{where}: two calibration points of an axis have the same value; they must differ")
+        raise TargetError(
+            f"{where}: two calibration points of an axis have the same value; they must differ"
+        )
     lengths = np.linalg.norm(steps, axis=0)
     if not abs(np.linalg.det(steps)) > SMALLEST_ANGLE * lengths[0] * lengths[1]:
-        raise TargetError(f"{where}: the calibration points coincide or lie on one line; calibrate the axes again")
+        raise TargetError(
+            f"{where}: the calibration points coincide or lie on one line; calibrate the axes again"
+        )
     if axes.get("noRotation") is True:
         steps = _upright(steps)
     matrix = values[:, None] * np.linalg.inv(steps)
@@ -188,7 +232,8 @@ def _calibration(
 
 
 def _upright(steps: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
-    """The steps without what leads across the image's edges, as WebPlotDigitizer does on request."""
+    """The steps without what leads across the image's edges, as WebPlotDigitizer does on
+    request."""
     straight = abs(steps[0, 0] * steps[1, 1]) > abs(steps[0, 1] * steps[1, 0])
     return np.where(np.eye(2, dtype=bool) == straight, steps, 0.0)
 
@@ -196,7 +241,9 @@ def _upright(steps: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
 def _axis_value(point: Any, key: str, log: bool, where: str) -> float:
     value = _number(point, key, where)
     if log and not value > 0:
-        raise TargetError(f"{where}: value {value:g} on a logarithmic axis; it must be larger than 0")
+        raise TargetError(
+            f"{where}: value {value:g} on a logarithmic axis; it must be larger than 0"
+        )
     return float(np.log10(value)) if log else value
 
 
@@ -208,7 +255,9 @@ def _number(table: Any, key: str, where: str) -> float:
     except ValueError:
         number = np.nan
     if not abs(number) < FURTHEST:
-        raise TargetError(f"{where}: {key} {value!r} is not a number; write 0.001 or 1e-3, with a decimal point")
+        raise TargetError(
+            f"{where}: {key} {value!r} is not a number; write 0.001 or 1e-3, with a decimal point"
+        )
     return number
 
 
@@ -221,7 +270,9 @@ def _table(value: Any, where: str) -> dict[str, Any]:
 def _get(table: Any, key: str, kind: type, where: str) -> Any:
     value = _table(table, where).get(key)
     if not isinstance(value, kind):
-        raise TargetError(f"{where}: is damaged: {key!r} is missing or no {kind.__name__}; {EXPORT}")
+        raise TargetError(
+            f"{where}: is damaged: {key!r} is missing or no {kind.__name__}; {EXPORT}"
+        )
     return value
 
 
@@ -234,7 +285,10 @@ def _part(
         pair = [*row[start : start + 2], "", ""][:2]
         if any(pair):
             values.append(
-                [_cell(cell, label, delimiter, f"{file}, {place}") for cell, label in zip(pair, LABELS, strict=True)]
+                [
+                    _cell(cell, label, delimiter, f"{file}, {place}")
+                    for cell, label in zip(pair, LABELS, strict=True)
+                ]
             )
             found.append(place)
     return values, found

@@ -1,4 +1,5 @@
-"""Frequency responses: the dynamic stiffness of a muscle, measured or published, with its errors."""
+"""Frequency responses: the dynamic stiffness of a muscle, measured or published, with its
+errors."""
 
 import os
 from collections.abc import Iterable, Mapping
@@ -36,9 +37,13 @@ class ResponseTable(Table, kw_only=True):
     imaginary: Annotated[Numbers, says("Imaginary part [N/m]")]
     stderr: Annotated[
         list[float | Literal["inf"]],
-        says('Standard error of both [N/m]; "inf" (a text) where a fit is to leave the frequency out'),
+        says(
+            'Standard error of both [N/m]; "inf" (a text) where a fit is to leave the frequency out'
+        ),
     ]
-    coherence: Annotated[Numbers | None, says("Squared coherence, 0 to 1", missing="unknown")] = None
+    coherence: Annotated[Numbers | None, says("Squared coherence, 0 to 1", missing="unknown")] = (
+        None
+    )
 
 
 class FrequencyResponse(Printed, eqx.Module):
@@ -46,16 +51,17 @@ class FrequencyResponse(Printed, eqx.Module):
 
         H(f) = F(f) / X(f)  [N/m]
 
-    X counts *lengthening* as positive, so that H has a positive real part at low frequency (a spring), and a positive
-    phase where it damps.
+    X counts *lengthening* as positive, so that H has a positive real part at low frequency (a
+    spring), and a positive phase where it damps.
 
     **Arguments:**
 
     - `frequency` [Hz], shape `(bins,)`: above 0 and rising.
     - `value` [N/m], shape `(bins,)`: H, complex.
-    - `stderr` [N/m], shape `(bins,)`: standard error of the real part, and of the imaginary part; infinite where the
-      value is of no use.
-    - `coherence`, shape `(bins,)`: the share of the force's power that follows the displacement, 0 to 1; or `None`.
+    - `stderr` [N/m], shape `(bins,)`: standard error of the real part, and of the imaginary part;
+      infinite where the value is of no use.
+    - `coherence`, shape `(bins,)`: the share of the force's power that follows the displacement, 0
+      to 1; or `None`.
     - `name`, `source`, `notices`: how reports call it, where it comes from, what was done to it.
 
     **Raises:** `ValueError` naming the argument, the entry and the remedy.
@@ -82,14 +88,30 @@ class FrequencyResponse(Printed, eqx.Module):
     ):
         self.frequency = _column("frequency", frequency, None)
         size = self.frequency.size
-        rising = (self.frequency > 0) & (np.diff(self.frequency, prepend=0.0) > 0) & (self.frequency < np.inf)
-        _require_all(rising, "frequency", self.frequency, "give rising frequencies above 0 Hz, each once")
+        rising = (
+            (self.frequency > 0)
+            & (np.diff(self.frequency, prepend=0.0) > 0)
+            & (self.frequency < np.inf)
+        )
+        _require_all(
+            rising, "frequency", self.frequency, "give rising frequencies above 0 Hz, each once"
+        )
         self.value = _column("value", value, size, complex)
-        _require_all(np.isfinite(self.value) & (self.value != 0), "value", self.value, "give finite numbers other than 0")
+        _require_all(
+            np.isfinite(self.value) & (self.value != 0),
+            "value",
+            self.value,
+            "give finite numbers other than 0",
+        )
         self.stderr = _column("stderr", stderr, size)
         remedy = "give standard errors above 0, infinite where a value is of no use"
         _require_all(self.stderr > 0, "stderr", self.stderr, remedy)
-        require(bool(np.any(np.isfinite(self.stderr))), "stderr", "all infinite", "give one that is finite")
+        require(
+            bool(np.any(np.isfinite(self.stderr))),
+            "stderr",
+            "all infinite",
+            "give one that is finite",
+        )
         self.coherence = None if coherence is None else _column("coherence", coherence, size)
         if self.coherence is not None:
             inside = (self.coherence >= 0) & (self.coherence <= 1)
@@ -126,23 +148,39 @@ class FrequencyResponse(Printed, eqx.Module):
         - `stderr` [N/m]
         - `name`, `source`, `notices`: as in `FrequencyResponse`
 
-        **Raises:** `ValueError` without `stderr` and without (`coherence` and `segments`), and as `FrequencyResponse` does.
+        **Raises:** `ValueError` without `stderr` and without (`coherence` and `segments`), and as
+        `FrequencyResponse` does.
 
-        **Source:** Bendat & Piersol, Random Data, 4th ed. 2010, section 9.2 (docs/perturbed.md derives it).
+        **Source:** Bendat & Piersol, Random Data, 4th ed. 2010, section 9.2 (docs/perturbed.md
+        derives it).
         """
         frequency = _column("frequency", frequency, None)
         gain, phase = (_column(n, v, frequency.size) for n, v in (("gain", gain), ("phase", phase)))
-        _require_all(gain > 0, "gain", gain, "give positive numbers; a negative stiffness has the phase 180")
+        _require_all(
+            gain > 0, "gain", gain, "give positive numbers; a negative stiffness has the phase 180"
+        )
         if stderr is None:
             if coherence is None or segments is None:
-                raise ValueError("stderr: is not known; give it, or the coherence and the number of independent averages, "
-                                 "as coherence=[0.9, ...], segments=40")  # fmt: skip
+                raise ValueError(
+                    "stderr: is not known; give it, or the coherence and the number of independent"
+                    " averages, as coherence=[0.9, ...], segments=40"
+                )
             shared = _column("coherence", coherence, frequency.size)
-            _require_all((shared >= 0) & (shared <= 1), "coherence", shared, "give the squared coherence, 0 to 1")
+            _require_all(
+                (shared >= 0) & (shared <= 1),
+                "coherence",
+                shared,
+                "give the squared coherence, 0 to 1",
+            )
             remedy = "the formula has no error for a coherence of 1; give `stderr`"
             _require_all(shared < 1, "coherence", shared, remedy)
             averages = np.broadcast_to(np.asarray(segments, float), frequency.shape)
-            _require_all(averages >= 1, "segments", averages, "give the number of independent averages, at least 1")
+            _require_all(
+                averages >= 1,
+                "segments",
+                averages,
+                "give the number of independent averages, at least 1",
+            )
             with np.errstate(divide="ignore"):
                 stderr = gain * np.sqrt((1 - shared) / (2 * averages * shared))
         value = gain * np.exp(1j * np.radians(phase))
@@ -156,7 +194,9 @@ class FrequencyResponse(Printed, eqx.Module):
             return self
         shared = None if self.coherence is None else self.coherence[kept]
         fields = {"name": self.name, "source": self.source, "notices": self.notices}
-        return FrequencyResponse(self.frequency[kept], self.value[kept], self.stderr[kept], shared, **fields)
+        return FrequencyResponse(
+            self.frequency[kept], self.value[kept], self.stderr[kept], shared, **fields
+        )
 
     @property
     def gain(self) -> Float[np.ndarray, " bins"]:
@@ -180,7 +220,8 @@ class FrequencyResponse(Printed, eqx.Module):
 
     @property
     def averages(self) -> Float[np.ndarray, " bins"] | None:
-        """How many independent averages errors and coherence imply: K = (1 - γ²) gain² / (2 γ² stderr²); or `None`."""
+        """How many independent averages errors and coherence imply: K = (1 - γ²) gain² / (2 γ²
+        stderr²); or `None`."""
         if self.coherence is None:
             return None
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -188,20 +229,24 @@ class FrequencyResponse(Printed, eqx.Module):
 
     @property
     def p_none(self) -> float:
-        """How probable a response as large as this one is if the force does not follow the displacement at all.
+        """How probable a response as large as this one is if the force does not follow the
+        displacement at all.
 
-            chi² = Σ |H|² / stderr²   over the frequencies, and the part of it along (K + iωB - ω²I) / stderr
+            chi² = Σ |H|² / stderr²   over the frequencies,
+            and the part of it along (K + iωB - ω²I) / stderr
 
-        have the chi² distribution with 2 · frequencies and with 3 degrees of freedom where H is 0. The smaller of both
-        probabilities is doubled, since two are looked at. With a `coherence` the errors are estimated from few averages, n
-        of them (`averages`), and the frequencies are those of overlapping segments, neighbours being correlated by 0.45.
-        Then every H / stderr is made shorter, its phase kept, so that its square is
+        have the chi² distribution with 2 · frequencies and with 3 degrees of freedom where H is 0.
+        The smaller of both probabilities is doubled, since two are looked at. With a `coherence`
+        the errors are estimated from few averages, n of them (`averages`), and the frequencies are
+        those of overlapping segments, neighbours being correlated by 0.45. Then every H / stderr is
+        made shorter, its phase kept, so that its square is
 
             2 (n - 1) ln(1 + |H|² / (2 (n - 1) stderr²))
 
-        which has the chi² distribution that it should have. Both sums are made of these. Since neighbours are correlated,
-        the first sum and its degrees of freedom are divided by 1.4; the second sum is divided by 1.9, and keeps its 3.
-        Above 0.001 (`UNSEEN`) the displacement says nothing of the muscle, and a fit refuses it.
+        which has the chi² distribution that it should have. Both sums are made of these. Since
+        neighbours are correlated, the first sum and its degrees of freedom are divided by 1.4; the
+        second sum is divided by 1.9, and keeps its 3. Above 0.001 (`UNSEEN`) the displacement says
+        nothing of the muscle, and a fit refuses it.
         """
         one, shared = self.known, (1.0, 1.0)
         size = (np.abs(one.value) / one.stderr) ** 2
@@ -210,25 +255,35 @@ class FrequencyResponse(Printed, eqx.Module):
             spare, shared = np.maximum(2 * (one.averages - 1), 1e-3), (1.4, 1.9)
             seen = spare * np.log1p(size / spare)
         weight = np.tile(np.sqrt(seen / size) / one.stderr, 2)
-        shapes = [parts(second_order_shape(one.frequency, unit)) / np.tile(one.stderr, 2) for unit in np.eye(3)]
+        shapes = [
+            parts(second_order_shape(one.frequency, unit)) / np.tile(one.stderr, 2)
+            for unit in np.eye(3)
+        ]
         basis = np.linalg.qr(np.stack(shapes, axis=1))[0]
         along = np.sum((basis.T @ (parts(one.value) * weight)) ** 2)
-        both = (seen.sum() / shared[0], 2 * seen.size / shared[0]), (along / shared[1], min(3, 2 * seen.size))
+        both = (
+            (seen.sum() / shared[0], 2 * seen.size / shared[0]),
+            (along / shared[1], min(3, 2 * seen.size)),
+        )
         return float(min(1.0, 2 * min(scipy.stats.chi2.sf(value, count) for value, count in both)))
 
     def to_table(self) -> dict[str, Any]:
         """The response as plain lists, for TOML and JSON; an infinite error is the text "inf"."""
         table: dict[str, Any] = {
-            "name": self.name, "source": self.source, "notices": list(self.notices),
+            "name": self.name,
+            "source": self.source,
+            "notices": list(self.notices),
             "frequency_hz": self.frequency.tolist(),
-            "real": np.real(self.value).tolist(), "imaginary": np.imag(self.value).tolist(),
+            "real": np.real(self.value).tolist(),
+            "imaginary": np.imag(self.value).tolist(),
             "stderr": [e if np.isfinite(e) else "inf" for e in self.stderr.tolist()],
-        }  # fmt: skip
+        }
         return table | ({} if self.coherence is None else {"coherence": self.coherence.tolist()})
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> "FrequencyResponse":
-        """The reverse of `to_table`, exactly. Raises `ValueError` for a key that is missing, unknown or of a wrong type."""
+        """The reverse of `to_table`, exactly. Raises `ValueError` for a key that is missing,
+        unknown or of a wrong type."""
         said = checked(dict(table), ResponseTable, "stiffness")
         require(
             len(said.real) == len(said.imaginary),
@@ -239,55 +294,81 @@ class FrequencyResponse(Printed, eqx.Module):
         value = np.asarray(said.real, float) + 1j * np.asarray(said.imaginary, float)
         stderr = [float(error) for error in said.stderr]
         return cls(
-            said.frequency_hz, value, stderr, said.coherence, name=said.name, source=said.source, notices=said.notices
+            said.frequency_hz,
+            value,
+            stderr,
+            said.coherence,
+            name=said.name,
+            source=said.source,
+            notices=said.notices,
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a CSV that `jaxmuscle.load_frequency_response` reads; an existing file is replaced in one step.
+        """Write a CSV that `jaxmuscle.load_frequency_response` reads; an existing file is replaced
+        in one step.
 
         **Raises:** `ValueError` if the path does not end in .csv.
         """
         path = Path(path).expanduser()
         require(
-            path.suffix.lower() == ".csv", "path", str(path), "a response is saved as text; give a name that ends in .csv"
+            path.suffix.lower() == ".csv",
+            "path",
+            str(path),
+            "a response is saved as text; give a name that ends in .csv",
         )
         columns = [self.frequency, self.gain, self.phase, self.stderr]
         columns += [] if self.coherence is None else [self.coherence]
         rows = [",".join(map(repr, row)) for row in np.stack(columns, axis=1).tolist()]
-        write_text(path, "\n".join([f"# {self.source}", ",".join(COLUMNS[: len(columns)]), *rows]) + "\n")
+        write_text(
+            path, "\n".join([f"# {self.source}", ",".join(COLUMNS[: len(columns)]), *rows]) + "\n"
+        )
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw gain, phase and coherence with their errors, see `jaxmuscle.plot.frequency_response`; returns the figure."""
+        """Draw gain, phase and coherence with their errors, see
+        `jaxmuscle.plot.frequency_response`; returns the figure."""
         return plot.frequency_response(self, ax)
 
     def __str__(self) -> str:
         f, error = self.frequency, self.stderr / self.gain
         lines = [
-            f"{self.name}: dynamic stiffness [N/m], {f.size} frequencies from {f[0]:.3g} to {f[-1]:.3g} Hz",
+            (
+                f"{self.name}: dynamic stiffness [N/m], {f.size} frequencies from {f[0]:.3g} to"
+                f" {f[-1]:.3g} Hz"
+            ),
             f"  source    {self.source}",
-            f"  gain      {self.gain.min():.4g} to {self.gain.max():.4g} N/m, standard error {100 * np.median(error):.2g} % "
-            "(median)",
+            (
+                f"  gain      {self.gain.min():.4g} to {self.gain.max():.4g} N/m, standard error"
+                f" {100 * np.median(error):.2g} % (median)"
+            ),
             f"  phase     {self.phase.min():.0f} to {self.phase.max():.0f} deg",
         ]
         if self.coherence is not None:
             low = int(np.argmin(self.coherence))
             median = np.median(self.coherence)
-            lines.append(f"  coherence {median:.2f} (median), lowest {self.coherence[low]:.2f} at {f[low]:.3g} Hz")
+            lines.append(
+                f"  coherence {median:.2f} (median), lowest {self.coherence[low]:.2f} at"
+                f" {f[low]:.3g} Hz"
+            )
         if self.p_none > UNSEEN:
-            lines.append("  notice    the force does not follow the displacement: no gain is larger than chance makes it. "
-                         "Is this the channel that moved the insertion?")  # fmt: skip
+            lines.append(
+                "  notice    the force does not follow the displacement: no gain is larger than"
+                " chance makes it. Is this the channel that moved the insertion?"
+            )
         return folded(lines + [f"  notice    {notice}" for notice in self.notices])
 
 
 def check_seen(response: FrequencyResponse, whose: str) -> None:
-    """Raise a `ValueError` if chance alone explains a response: the force does not follow the displacement."""
+    """Raise a `ValueError` if chance alone explains a response: the force does not follow the
+    displacement."""
     if response.p_none <= UNSEEN:
         return
-    raise ValueError(f"{whose}: the force does not follow the displacement at any frequency: chance alone makes a response "
-                     f"this large with {probability(response.p_none)}. So it tells nothing of stiffness and damping. Check "
-                     "that the displacement is the channel that moved the insertion, and that one clock timed both. If they "
-                     "are right, move more or record longer. The force alone is fitted with jaxmuscle.Isometric() "
-                     "(--task isometric)")  # fmt: skip
+    raise ValueError(
+        f"{whose}: the force does not follow the displacement at any frequency: chance alone makes"
+        f" a response this large with {probability(response.p_none)}. So it tells nothing of"
+        " stiffness and damping. Check that the displacement is the channel that moved the"
+        " insertion, and that one clock timed both. If they are right, move more or record longer."
+        " The force alone is fitted with jaxmuscle.Isometric() (--task isometric)"
+    )
 
 
 def _column(name: str, given: Any, size: int | None, kind: type = float) -> Any:
@@ -295,8 +376,15 @@ def _column(name: str, given: Any, size: int | None, kind: type = float) -> Any:
         values = np.array(given, dtype=kind)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: give numbers, one for each frequency") from None
-    remedy = "give a list of numbers" if size is None else f"give {size} values, one for each frequency"
-    require(values.ndim == 1 and values.size > 0 and size in (None, values.size), f"{name} shape", values.shape, remedy)
+    remedy = (
+        "give a list of numbers" if size is None else f"give {size} values, one for each frequency"
+    )
+    require(
+        values.ndim == 1 and values.size > 0 and size in (None, values.size),
+        f"{name} shape",
+        values.shape,
+        remedy,
+    )
     return frozen(values)
 
 

@@ -1,4 +1,5 @@
-"""Published frequency responses in files: gain, phase and coherence as columns of a text or a sheet."""
+"""Published frequency responses in files: gain, phase and coherence as columns of a text or a
+sheet."""
 
 import os
 import re
@@ -20,11 +21,16 @@ from ._text_tables import TEXT, beginning
 STIFFNESS = {"n/m": 1.0, "n/cm": 1e2, "n/mm": 1e3, "kn/m": 1e3, "mn/mm": 1.0}
 ROTATION = {"nm/rad": 1.0, "nm/deg": 180 / np.pi, "mnm/rad": 1e-3, "mnm/deg": 0.18 / np.pi}
 UNITS: dict[str, tuple[str, ...]] = {  # of each column, the first being that of a name without unit
-    "frequency": ("hz",), "gain": (*STIFFNESS, *ROTATION, "db"), "phase": ("deg", "rad"), "coherence": ("",),
+    "frequency": ("hz",),
+    "gain": (*STIFFNESS, *ROTATION, "db"),
+    "phase": ("deg", "rad"),
+    "coherence": ("",),
     "stderr": (*STIFFNESS, *ROTATION),
-}  # fmt: skip
+}
 FITTED = ("frequency_hz", "real", "imaginary", "stderr")  # of stiffness.csv
-_HEADER = re.compile(r"(frequency|freq|f|gain|phase|coherence|stderr)(?:[ _/]*[\[(]?([^\[\]()]*?)[\])]?)")
+_HEADER = re.compile(
+    r"(frequency|freq|f|gain|phase|coherence|stderr)(?:[ _/]*[\[(]?([^\[\]()]*?)[\])]?)"
+)
 
 
 def load_frequency_response(
@@ -35,7 +41,8 @@ def load_frequency_response(
     name: str | None = None,
     source: str | None = None,
 ) -> FrequencyResponse:
-    """Load a dynamic stiffness over frequency, as published figures show it, from a text (.csv, ...) or a sheet (.xlsx).
+    """Load a dynamic stiffness over frequency, as published figures show it, from a text (.csv,
+    ...) or a sheet (.xlsx).
 
         response = jm.load_frequency_response("response.csv", segments=30)
         result = jm.fit(jm.PrescribedLength(), response)
@@ -43,16 +50,19 @@ def load_frequency_response(
         frequency_hz,gain_N/mm,phase_deg,coherence
         0.5,4.1,3,0.92
 
-    The columns are found by their names, in any order: `frequency`, `gain`, `phase`, and `coherence` or `stderr` or both. A
-    unit may follow: `gain` in N/m (without unit), N/cm, N/mm, kN/m, in Nm/rad or Nm/deg with a lever arm, or in dB above 1
-    N/m; `phase` in deg (without unit) or rad; `stderr`, of the gain, in the gain's unit. Phase and gain are those of force
-    over *lengthening*: the phase is near 0 at low frequency. `FrequencyResponse.save` writes such a file. `stiffness.csv`,
-    which `jaxmuscle fit` writes, is read as well: its columns `real`, `imaginary` and `stderr` [N/m], not what was fitted.
+    The columns are found by their names, in any order: `frequency`, `gain`, `phase`, and
+    `coherence` or `stderr` or both. A unit may follow: `gain` in N/m (without unit), N/cm, N/mm,
+    kN/m, in Nm/rad or Nm/deg with a lever arm, or in dB above 1 N/m; `phase` in deg (without unit)
+    or rad; `stderr`, of the gain, in the gain's unit. Phase and gain are those of force over
+    *lengthening*: the phase is near 0 at low frequency. `FrequencyResponse.save` writes such a
+    file. `stiffness.csv`, which `jaxmuscle fit` writes, is read as well: its columns `real`,
+    `imaginary` and `stderr` [N/m], not what was fitted.
 
     **Arguments:**
 
     - `path`: the file
-    - `segments`: the number of independent averages, one or one for each frequency, needed without `stderr`
+    - `segments`: the number of independent averages, one or one for each frequency, needed without
+      `stderr`
     - `lever_arm` [m]: which turns torque over angle into force over displacement
     - `name`: by default that of the file
     - `source`
@@ -68,22 +78,37 @@ def load_frequency_response(
     else:
         found = _columns(table)
         column = {role: _numbers(table, name, role) for role, (name, _) in found.items()}
-        scales = {role: _scale(table, *found[role], lever_arm) for role in ("gain", "stderr") if role in found}
-        gain = 10 ** (column["gain"] / 20) if found["gain"][1] == "db" else column["gain"] * scales["gain"]
+        scales = {
+            role: _scale(table, *found[role], lever_arm)
+            for role in ("gain", "stderr")
+            if role in found
+        }
+        gain = (
+            10 ** (column["gain"] / 20)
+            if found["gain"][1] == "db"
+            else column["gain"] * scales["gain"]
+        )
         phase = np.degrees(column["phase"]) if found["phase"][1] == "rad" else column["phase"]
     _rising(table, column["frequency"])
     stderr = None if "stderr" not in column else column["stderr"] * scales["stderr"]
     try:
-        return FrequencyResponse.from_gain(column["frequency"], gain, phase, coherence=column.get("coherence"),
-                                           segments=segments, stderr=stderr,
-                                           name=printable(file.stem) if name is None else name,
-                                           source=printable(file.name) if source is None else source)  # fmt: skip
+        return FrequencyResponse.from_gain(
+            column["frequency"],
+            gain,
+            phase,
+            coherence=column.get("coherence"),
+            segments=segments,
+            stderr=stderr,
+            name=printable(file.stem) if name is None else name,
+            source=printable(file.name) if source is None else source,
+        )
     except ValueError as error:
         raise ValueError(f"{table.file}: {_at_its_line(str(error), table)}") from None
 
 
 def is_frequency_response(path: str | os.PathLike[str]) -> bool:
-    """Whether the text at `path` has the columns that `load_frequency_response` reads: frequency, gain and phase, say.
+    """Whether the text at `path` has the columns that `load_frequency_response` reads: frequency,
+    gain and phase, say.
 
         jm.data.is_frequency_response("response.csv")
 
@@ -97,23 +122,36 @@ def is_response(names: Iterable[str]) -> bool:
     """Whether columns of these names are those of a frequency response."""
     names = {*names}
     found = {match[1] for name in names if (match := _HEADER.fullmatch(name))}
-    return {*FITTED} <= names or ({"gain", "phase"} <= found and bool(found & {"frequency", "freq", "f"}))
+    return {*FITTED} <= names or (
+        {"gain", "phase"} <= found and bool(found & {"frequency", "freq", "f"})
+    )
 
 
 def _columns(table: Table) -> dict[str, tuple[str, str]]:
     """Name and unit of the column of each role."""
     found: dict[str, tuple[str, str]] = {}
-    for name in sorted(table.columns, key=lambda name: name.casefold().startswith("stderr")):  # it takes the gain's unit
+    # it takes the gain's unit
+    for name in sorted(table.columns, key=lambda name: name.casefold().startswith("stderr")):
         match = _HEADER.fullmatch(name.strip().casefold())
         role = None if match is None else match[1] if match[1] not in ("freq", "f") else "frequency"
         if match is None or role is None:
             raise ValueError(f"{table.file}: unknown column {name!r}; {choices(name, COLUMNS)}")
         if role in found:
-            raise ValueError(f"{table.file}: the columns {found[role][0]!r} and {name!r} are both the {role}; keep one")
-        unit = "".join(c for c in (match[2] or table.units.get(name, "")).casefold() if c not in " ·*.")
-        unit = unit or (found["gain"][1] if role == "stderr" and "gain" in found else UNITS[role][0])
+            raise ValueError(
+                f"{table.file}: the columns {found[role][0]!r} and {name!r} are both the {role};"
+                " keep one"
+            )
+        unit = "".join(
+            c for c in (match[2] or table.units.get(name, "")).casefold() if c not in " ·*."
+        )
+        unit = unit or (
+            found["gain"][1] if role == "stderr" and "gain" in found else UNITS[role][0]
+        )
         if unit not in UNITS[role]:
-            raise ValueError(f"{table.file}: column {name!r}: unknown unit {unit!r}; {choices(unit, UNITS[role])}")
+            raise ValueError(
+                f"{table.file}: column {name!r}: unknown unit {unit!r};"
+                f" {choices(unit, UNITS[role])}"
+            )
         found[role] = name, unit
     for role in ("frequency", "gain", "phase"):
         if role not in found:
@@ -126,7 +164,9 @@ def _numbers(table: Table, name: str, role: str) -> Float[np.ndarray, " rows"]:
     wrong = np.flatnonzero(~np.isfinite(values) & ~((role == "stderr") & (values == np.inf)))
     if wrong.size:
         where = f"{table.file}, {table.place(int(wrong[0]))}"
-        raise ValueError(f"{where}: {name} is missing or not finite; leave the row out if it is not known")
+        raise ValueError(
+            f"{where}: {name} is missing or not finite; leave the row out if it is not known"
+        )
     return values
 
 
@@ -144,7 +184,10 @@ def _rising(table: Table, frequency: Float[np.ndarray, " rows"]) -> None:
     wrong = np.flatnonzero(np.diff(frequency) <= 0)
     if wrong.size:
         where = f"{table.file}, {table.place(int(wrong[0]) + 1)}"
-        raise ValueError(f"{where}: frequency {frequency[wrong[0] + 1]:g} Hz does not rise; sort, one row per frequency")
+        raise ValueError(
+            f"{where}: frequency {frequency[wrong[0] + 1]:g} Hz does not rise; sort, one row per"
+            " frequency"
+        )
 
 
 def _at_its_line(message: str, table: Table) -> str:

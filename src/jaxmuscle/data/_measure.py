@@ -15,11 +15,13 @@ FARTHEST = 300.0  # logarithm of a factor, so that no end overflows
 
 
 class Measure(eqx.Module):
-    """A `value` with its standard error `stderr` (`None` if there is none), both in `unit` ("1" for pure numbers).
+    """A `value` with its standard error `stderr` (`None` if there is none), both in `unit` ("1" for
+    pure numbers).
 
-    `error_from` says what the error stands on: "trials", the scatter between three or more trials; or, of fewer trials,
-    what is within them: "spectrum", "parts" or "segments", see `steadiness`. `interval` has the ends of the 95 % interval,
-    in `unit`, `None` where there is no error. A value that does not exist is NaN.
+    `error_from` says what the error stands on: "trials", the scatter between three or more trials;
+    or, of fewer trials, what is within them: "spectrum", "parts" or "segments", see `steadiness`.
+    `interval` has the ends of the 95 % interval, in `unit`, `None` where there is no error. A value
+    that does not exist is NaN.
     """
 
     value: float
@@ -32,19 +34,32 @@ class Measure(eqx.Module):
         """As columns of a table, NaN for what does not exist."""
         low, high = self.interval or (math.nan, math.nan)
         error = math.nan if self.stderr is None else self.stderr
-        return {"value": self.value, "stderr": error, "low": low, "high": high, "unit": self.unit,
-                "error_from": self.error_from}  # fmt: skip
+        return {
+            "value": self.value,
+            "stderr": error,
+            "low": low,
+            "high": high,
+            "unit": self.unit,
+            "error_from": self.error_from,
+        }
 
 
 def likelier_error(each: Sequence[Measure]) -> float | None:
-    """The error of a mean by the own errors e of its values, if these scatter (s) so little that it must be chance.
+    """The error of a mean by the own errors e of its values, if these scatter (s) so little that it
+    must be chance.
 
-    (n - 1) s² / e² has a chi-squared law of n - 1 degrees of freedom where nothing else than these errors acts, and a
-    larger value where the values truly differ.
+    (n - 1) s² / e² has a chi-squared law of n - 1 degrees of freedom where nothing else than these
+    errors acts, and a larger value where the values truly differ.
     """
     errors = np.array([math.nan if m.stderr is None else m.stderr for m in each])
-    scatter = (len(each) - 1) * float(np.var([m.value for m in each], ddof=1)) / float(np.mean(errors**2))
-    return math.hypot(*errors) / len(each) if scipy.special.chdtr(len(each) - 1, scatter) < RARE else None
+    scatter = (
+        (len(each) - 1) * float(np.var([m.value for m in each], ddof=1)) / float(np.mean(errors**2))
+    )
+    return (
+        math.hypot(*errors) / len(each)
+        if scipy.special.chdtr(len(each) - 1, scatter) < RARE
+        else None
+    )
 
 
 def normal_interval(value: float, error: float) -> tuple[float, float]:
@@ -53,13 +68,15 @@ def normal_interval(value: float, error: float) -> tuple[float, float]:
 
 
 def student_interval(value: float, error: float, degrees: int) -> tuple[float, float]:
-    """`value ± t error`, with the t of Student that so many degrees of freedom of the squared error ask for."""
+    """`value ± t error`, with the t of Student that so many degrees of freedom of the squared error
+    ask for."""
     reach = student(degrees + 1) * error
     return value - reach, value + reach
 
 
 def log_interval(value: float, error: float) -> tuple[float, float]:
-    """`value · exp(± 1.96 error / value)`, normal in the logarithm; of 0, which has no error, 0 to 0."""
+    """`value · exp(± 1.96 error / value)`, normal in the logarithm; of 0, which has no error, 0 to
+    0."""
     if value <= 0:
         return value, value
     factor = math.exp(min(NORMAL * error / value, FARTHEST))
@@ -67,7 +84,8 @@ def log_interval(value: float, error: float) -> tuple[float, float]:
 
 
 def logit_interval(share: float, error: float) -> tuple[float, float]:
-    """That of the odds p / (1 - p), normal in their logarithm, so that both ends are shares; of 0 and 1, themselves."""
+    """That of the odds p / (1 - p), normal in their logarithm, so that both ends are shares; of 0
+    and 1, themselves."""
     if share >= 1:
         return share, share
     low, high = log_interval(share / (1 - share), error / (1 - share) ** 2)

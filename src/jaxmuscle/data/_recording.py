@@ -1,4 +1,5 @@
-"""Recordings: what was measured (force, torque, motion), its steady part, its spectra, and the target it gives."""
+"""Recordings: what was measured (force, torque, motion), its steady part, its spectra, and the
+target it gives."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -40,16 +41,18 @@ class Recording(Shown, eqx.Module):
 
     - `samples`: the signal [`unit`], shape `(times,)`.
     - `rate`: samples per second [Hz], at least 24, so that bin 30 lies below half of it.
-    - `unit`: N, mN, kN, kgf, gf, lbf, % MVC (force); N m, N cm, N mm (torque); m, cm, mm, um (displacement); m/s^2,
-      mm/s^2, g, mg (acceleration; g is 9.81 m/s^2); V, mV, a.u.
+    - `unit`: N, mN, kN, kgf, gf, lbf, % MVC (force); N m, N cm, N mm (torque); m, cm, mm, um
+      (displacement); m/s^2, mm/s^2, g, mg (acceleration; g is 9.81 m/s^2); V, mV, a.u.
     - `name`, `source`: how reports call it and where it comes from.
     - `start`: time of the first sample [s]; other than 0 if the file begins with a gap.
     - `window`: (start, stop) [s] of the part that is analysed, or all of it.
     - `notices`: what was done to the samples, in sentences.
 
-    `whole` holds all samples, since filters run before the window is cut; `samples` and `time` are the window's.
+    `whole` holds all samples, since filters run before the window is cut; `samples` and `time` are
+    the window's.
 
-    **Raises:** `ValueError` naming the argument, its value and the remedy; also for a constant signal.
+    **Raises:** `ValueError` naming the argument, its value and the remedy; also for a constant
+    signal.
     """
 
     whole: Float[np.ndarray, " all"]
@@ -85,14 +88,25 @@ class Recording(Shown, eqx.Module):
         self.window = None if window is None else self._checked(window)
 
     @classmethod
-    def from_dataframe(cls, frame: Any, *, column: str | int | None = None, rate: float | int | None = None,
-                       units: str | None = None, axis: str | None = None, reference: str | int | None = None,
-                       time: str | int | None = None, max_gap: float | int = 0.2, lever_arm: float | int | None = None,
-                       name: str = "recording") -> "Recording":  # fmt: skip
+    def from_dataframe(
+        cls,
+        frame: Any,
+        *,
+        column: str | int | None = None,
+        rate: float | int | None = None,
+        units: str | None = None,
+        axis: str | None = None,
+        reference: str | int | None = None,
+        time: str | int | None = None,
+        max_gap: float | int = 0.2,
+        lever_arm: float | int | None = None,
+        name: str = "recording",
+    ) -> "Recording":
         """A recording from a pandas table, by the rules for tables in files.
 
-        **Arguments:** `frame`, a `pandas.DataFrame`. Its times are a column, or the index: numbers in s, a `DatetimeIndex`
-        or a `TimedeltaIndex`. `name` as in `Recording`; the others as in `load_recording`.
+        **Arguments:** `frame`, a `pandas.DataFrame`. Its times are a column, or the index: numbers
+        in s, a `DatetimeIndex` or a `TimedeltaIndex`. `name` as in `Recording`; the others as in
+        `load_recording`.
 
         **Raises:** `ValueError` naming column, row or argument, and the remedy.
         """
@@ -100,9 +114,19 @@ class Recording(Shown, eqx.Module):
         return recording_of(cls, frame_table(frame), reading, name)
 
     @classmethod
-    def from_array(cls, samples: Any, rate: float | int, *, column: int = 0, unit: str = "N", name: str = "recording",
-                   source: str = "given by the user", start: float | int = 0.0, window: Sequence[float | int] | None = None,
-                   notices: Iterable[str] = ()) -> "Recording":  # fmt: skip
+    def from_array(
+        cls,
+        samples: Any,
+        rate: float | int,
+        *,
+        column: int = 0,
+        unit: str = "N",
+        name: str = "recording",
+        source: str = "given by the user",
+        start: float | int = 0.0,
+        window: Sequence[float | int] | None = None,
+        notices: Iterable[str] = (),
+    ) -> "Recording":
         """A recording from an array: one signal, or a column of several.
 
         **Arguments:**
@@ -115,18 +139,37 @@ class Recording(Shown, eqx.Module):
         """
         array = np.asarray(samples)
         if array.ndim == 2:
-            require(0 <= column < array.shape[1], "column", column, f"give a number from 0 to {array.shape[1] - 1}")
+            require(
+                0 <= column < array.shape[1],
+                "column",
+                column,
+                f"give a number from 0 to {array.shape[1] - 1}",
+            )
             array = array[:, column]
-        return cls(array, rate, unit=unit, name=name, source=source, start=start, window=window, notices=notices)
+        return cls(
+            array,
+            rate,
+            unit=unit,
+            name=name,
+            source=source,
+            start=start,
+            window=window,
+            notices=notices,
+        )
 
     def _checked(self, window: Any) -> tuple[float, float]:
         try:
             a, b = (float(edge) for edge in window)
         except (TypeError, ValueError):
             raise ValueError(f"window={window!r}: give two times in s, as (8, 25)") from None
-        remedy = f"give times with {self.start:g} <= start < stop <= {self.stop:g} s, the recording's own"
+        remedy = (
+            f"give times with {self.start:g} <= start < stop <= {self.stop:g} s, the"
+            " recording's own"
+        )
         near = 0.5 / self.rate
-        require(self.start - near <= a < b <= self.stop + near, f"{self.name}: window", window, remedy)
+        require(
+            self.start - near <= a < b <= self.stop + near, f"{self.name}: window", window, remedy
+        )
         return a, b
 
     def span(self, rate: float | int) -> tuple[int, int]:
@@ -160,55 +203,90 @@ class Recording(Shown, eqx.Module):
 
     @property
     def quantity(self) -> Quantity | None:
-        """What the unit measures: force, torque, displacement, acceleration, or `None` (V, a.u.)."""
+        """What the unit measures: force, torque, displacement, acceleration, or `None` (V,
+        a.u.)."""
         return UNITS[self.unit]
 
     def resampled(self, rate: float | int = 100.0) -> "Recording":
-        """The recording at another rate: `scipy.signal.resample_poly`, which low-passes against aliases.
+        """The recording at another rate: `scipy.signal.resample_poly`, which low-passes against
+        aliases.
 
-        The ratio of the rates is taken as the nearest fraction with a denominator of at most 10 000. Beyond the ends
-        the straight line from the first to the last sample is assumed (`padtype="line"`).
+        The ratio of the rates is taken as the nearest fraction with a denominator of at most
+        10 000. Beyond the ends the straight line from the first to the last sample is assumed
+        (`padtype="line"`).
 
         **Raises:** `ValueError` if no such fraction is within 0.01 % of the ratio.
         """
         rate = _rate(rate)
         ratio = Fraction(rate / self.rate).limit_denominator(10_000)
         close = math.isclose(float(ratio), rate / self.rate, rel_tol=1e-4)
-        require(close, "rate", rate, f"is too far from the {self.rate:g} Hz recorded; give a rate nearer to it")
+        require(
+            close,
+            "rate",
+            rate,
+            f"is too far from the {self.rate:g} Hz recorded; give a rate nearer to it",
+        )
         if ratio == 1:
             return self
-        samples = scipy.signal.resample_poly(self.whole, ratio.numerator, ratio.denominator, padtype="line")
+        samples = scipy.signal.resample_poly(
+            self.whole, ratio.numerator, ratio.denominator, padtype="line"
+        )
         return self._with(samples, rate, self.window, self.notices)
 
     def steady(self, window: Sequence[float | int] | None = None) -> "Recording":
-        """The recording with its steady part as window: the one that is given, or the plateau of a ramp-and-hold.
+        """The recording with its steady part as window: the one that is given, or the plateau of a
+        ramp-and-hold.
 
-        The plateau is the longest stretch in which the running median over 1 s differs from the level by at most a tenth of
-        the height from rest to level. Rest is that extreme of the running median which is nearer to zero, the peak is the
-        other one, and the level is the median of what lies more than half-way from rest to peak. The plateau has to hold at
-        least half of the time spent beyond half-way; one second is taken off at the ramps. Without a ramp (running median
-        within a fifth of its largest value) all of it is steady. So is an acceleration, which holds no level.
+        The plateau is the longest stretch in which the running median over 1 s differs from the
+        level by at most a tenth of the height from rest to level. Rest is that extreme of the
+        running median which is nearer to zero, the peak is the other one, and the level is the
+        median of what lies more than half-way from rest to peak. The plateau has to hold at least
+        half of the time spent beyond half-way; one second is taken off at the ramps. Without a ramp
+        (running median within a fifth of its largest value) all of it is steady. So is an
+        acceleration, which holds no level.
 
         **Arguments:** `window` (start, stop) [s], in the recording's own time.
 
-        **Raises:** `ValueError` if no plateau is found, and if the window is shorter than two Welch segments (3.84 s).
+        **Raises:** `ValueError` if no plateau is found, and if the window is shorter than two Welch
+        segments (3.84 s).
         """
         notices, found = self.notices, None
         if window is None:
             even = self.resampled(RECORDED.rate)
             everything = (0, even.whole.size)
-            found = everything if self.quantity == "acceleration" else plateau(even.whole, even.rate)
+            found = (
+                everything if self.quantity == "acceleration" else plateau(even.whole, even.rate)
+            )
             if found is None:
-                raise ValueError(f"{self.name}: no steady part was found: the signal must stay within 10 % of one level for "
-                                 "at least half of the time under load, and longer than 2 s. Is it the right column? Then "
-                                 "give the part yourself: --window a:b (in Python steady((a, b))), between "
-                                 f"{self.start:g} and {self.stop:g} s")  # fmt: skip
-            window = (self.start + found[0] / even.rate, min(self.start + found[1] / even.rate, self.stop))
-            notices = (*notices, UNRAMPED if found == everything else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s")
+                raise ValueError(
+                    f"{self.name}: no steady part was found: the signal must stay within 10 % of"
+                    " one level for at least half of the time under load, and longer than 2 s. Is"
+                    " it the right column? Then give the part yourself: --window a:b (in Python"
+                    f" steady((a, b))), between {self.start:g} and {self.stop:g} s"
+                )
+            window = (
+                self.start + found[0] / even.rate,
+                min(self.start + found[1] / even.rate, self.stop),
+            )
+            notices = (
+                *notices,
+                (
+                    UNRAMPED
+                    if found == everything
+                    else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s"
+                ),
+            )
         part = self._with(self.whole, self.rate, window, notices)
         if (held := part.segments()) < SEGMENTS:
-            what = f"window={part.window!r}" if found is None else f"its steady part of {part.duration:.3g} s"
-            words = f"holds {held} of the {SEGMENTS} Welch segments needed; give at least {SHORTEST:g} s"
+            what = (
+                f"window={part.window!r}"
+                if found is None
+                else f"its steady part of {part.duration:.3g} s"
+            )
+            words = (
+                f"holds {held} of the {SEGMENTS} Welch segments needed; give at least"
+                f" {SHORTEST:g} s"
+            )
             raise ValueError(f"{self.name}: {what} {words}")
         return part
 
@@ -218,8 +296,11 @@ class Recording(Shown, eqx.Module):
         first, stop = self.span(settings.rate)
         return settings.segments(stop - first)
 
-    def filtered(self, settings: SpectrumSettings | str | None = None) -> Float[np.ndarray, " times"]:
-        """What the spectra are made of [`unit`]: resampled to `settings.rate`, low-passed as a whole, cut to the window."""
+    def filtered(
+        self, settings: SpectrumSettings | str | None = None
+    ) -> Float[np.ndarray, " times"]:
+        """What the spectra are made of [`unit`]: resampled to `settings.rate`, low-passed as a
+        whole, cut to the window."""
         settings = recorded_settings(settings)
         even = self.resampled(settings.rate)
         with jax.enable_x64(True):
@@ -229,9 +310,11 @@ class Recording(Shown, eqx.Module):
     def spectrum(self, settings: SpectrumSettings | str | None = None) -> Spectrum:
         """Welch spectrum of the window, in float64: resampled and low-passed before it is cut.
 
-        **Arguments:** `settings`, by default the standard ones filtered both ways; or a name (`SpectrumSettings.named`).
+        **Arguments:** `settings`, by default the standard ones filtered both ways; or a name
+        (`SpectrumSettings.named`).
 
-        **Raises:** `ValueError` if the window is constant or below one segment, or bins lie above half the recorded rate.
+        **Raises:** `ValueError` if the window is constant or below one segment, or bins lie above
+        half the recorded rate.
         """
         settings = recorded_settings(settings)
         highest = float(settings.frequency[-1])
@@ -246,20 +329,30 @@ class Recording(Shown, eqx.Module):
         return Spectrum(settings.frequency, power, settings, self.unit)
 
     def fft_spectrum(self, settings: SpectrumSettings | str | None = None) -> Spectrum:
-        """The same with the whole window as one segment (periodogram), in the frequency range of the settings."""
+        """The same with the whole window as one segment (periodogram), in the frequency range of
+        the settings."""
         settings = recorded_settings(settings)
         first, stop = self.span(settings.rate)
         low, high = (float(settings.frequency[i]) * (stop - first) / settings.rate for i in (0, -1))
-        require(stop - first >= 8 and high >= 1, "window", self.window, "is too short for a spectrum; give a longer one")
+        require(
+            stop - first >= 8 and high >= 1,
+            "window",
+            self.window,
+            "is too short for a spectrum; give a longer one",
+        )
         bins = {"first_bin": math.ceil(low - 1e-9), "last_bin": math.floor(high + 1e-9)}
         return self.spectrum(settings.replace(length=stop - first, **bins))
 
     def _require_change(self) -> None:
         if np.ptp(self.samples) <= 1e-12 * np.max(np.abs(self.samples)):
-            raise ValueError(f"{self.name}: is constant in the window {self.window}; choose another window or column")
+            raise ValueError(
+                f"{self.name}: is constant in the window {self.window}; choose another window or"
+                " column"
+            )
 
     def summary(self, settings: SpectrumSettings | str | None = None) -> RecordingSummary:
-        """Level, variability, regularity and spectral peaks of the window, after resampling and low-pass.
+        """Level, variability, regularity and spectral peaks of the window, after resampling and
+        low-pass.
 
         **Returns:** a `RecordingSummary`; it prints as a table.
         """
@@ -292,30 +385,40 @@ class Recording(Shown, eqx.Module):
     ) -> Target:
         """The window's proportional power as a `Target` for `jaxmuscle.fit`.
 
-        It states the Welch segments, the settings, and for a force or torque the mean and the coefficient of variation of
-        what the low-pass lets through, which fixes the scale of the noise; and says so if most of that is a straight
-        drift. Several recordings of one condition give one target: `Trials.target`.
+        It states the Welch segments, the settings, and for a force or torque the mean and the
+        coefficient of variation of what the low-pass lets through, which fixes the scale of the
+        noise; and says so if most of that is a straight drift. Several recordings of one condition
+        give one target: `Trials.target`.
 
         **Arguments:**
 
         - `name`: or that of the recording
         - `quantity`: or that of the unit
         - `provenance`
-        - `mvc` [`unit`]: the maximal voluntary contraction, for the level (a recording in % MVC needs none)
+        - `mvc` [`unit`]: the maximal voluntary contraction, for the level (a recording in % MVC
+          needs none)
         - `settings`: as for `spectrum`
 
-        **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as `spectrum` does.
+        **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as
+        `spectrum` does.
         """
         settings = recorded_settings(settings)
-        return pooled_target((self,), self.name if name is None else name, quantity, provenance, mvc, settings)
+        return pooled_target(
+            (self,), self.name if name is None else name, quantity, provenance, mvc, settings
+        )
 
     @property
     def window_in_words(self) -> str:
         """The window, or that there is none."""
-        return "all of it" if self.window is None else f"window {self.window[0]:g} s to {self.window[1]:g} s"
+        return (
+            "all of it"
+            if self.window is None
+            else f"window {self.window[0]:g} s to {self.window[1]:g} s"
+        )
 
     def plot(self, settings: SpectrumSettings | str | None = None, ax: Any = None) -> Any:
-        """Draw the trace with its window, and the spectra (Welch, FFT), linear and logarithmic; returns the figure."""
+        """Draw the trace with its window, and the spectra (Welch, FFT), linear and logarithmic;
+        returns the figure."""
         return plot.recording(self, settings, ax)
 
     def _card(self) -> Card:
@@ -326,18 +429,31 @@ class Recording(Shown, eqx.Module):
             ("range", f"{np.min(self.samples):.4g} to {np.max(self.samples):.4g} {self.unit}"),
             *(("notice", notice) for notice in self.notices),
         ]
-        return facts(f"{self.name}: {what} [{self.unit}], {self.whole.size} samples at {self.rate:g} Hz", known)
+        return facts(
+            f"{self.name}: {what} [{self.unit}], {self.whole.size} samples at {self.rate:g} Hz",
+            known,
+        )
 
 
 def recorded_settings(settings: SpectrumSettings | str | None) -> SpectrumSettings:
-    """As given, or those of a name, by default the standard; named ones filter and sample as recordings are."""
+    """As given, or those of a name, by default the standard; named ones filter and sample as
+    recordings are."""
     given = isinstance(settings, SpectrumSettings)
-    return settings if given else SpectrumSettings.named(settings or "standard").replace(**AS_RECORDED)
+    return (
+        settings if given else SpectrumSettings.named(settings or "standard").replace(**AS_RECORDED)
+    )
 
 
 def _rate(rate: Any) -> float:
-    number = isinstance(rate, int | float | np.number) and not isinstance(rate, bool) and math.isfinite(rate)
+    number = (
+        isinstance(rate, int | float | np.number)
+        and not isinstance(rate, bool)
+        and math.isfinite(rate)
+    )
     require(number and rate > 0, "rate", rate, "give samples per second [Hz], above 0")
-    remedy = f"too slow: half of it lies below the last bin, 11.72 Hz; record at {LOWEST_RATE:g} Hz or more"
+    remedy = (
+        f"too slow: half of it lies below the last bin, 11.72 Hz; record at {LOWEST_RATE:g} Hz or"
+        " more"
+    )
     require(rate >= LOWEST_RATE, "rate", rate, remedy)
     return float(rate)

@@ -13,9 +13,12 @@ from jaxtyping import Float
 from ._text_tables import cells_of, is_number, number_in, width_remedy
 
 MISSING = ("", "nan", "-nan", "na", "n/a", "null", "none")
-_WRITTEN = sorted({change(word) for word in MISSING for change in (str, str.upper, str.title)} | {"NaN", "-NaN"})
+_WRITTEN = sorted(
+    {change(word) for word in MISSING for change in (str, str.upper, str.title)} | {"NaN", "-NaN"}
+)
 _MOMENT = re.compile(
-    r"(?:\d{4}-\d\d-\d\d[T ]|\d\d?[./]\d\d?[./]\d{4} )?(\d\d?):(\d\d):(\d\d(?:[.,]\d+)?)(?:Z|[+-]\d\d:?\d\d)?"
+    r"(?:\d{4}-\d\d-\d\d[T ]|\d\d?[./]\d\d?[./]\d{4}"
+    r" )?(\d\d?):(\d\d):(\d\d(?:[.,]\d+)?)(?:Z|[+-]\d\d:?\d\d)?"
 )
 _PIECE = 1 << 22  # bytes that are looked at together
 _ROWS = 1 << 16
@@ -23,7 +26,11 @@ _ROWS = 1 << 16
 
 def is_value(cell: str, delimiter: str | None) -> bool:
     """Whether a cell holds a number, a time of day, or a word for a missing number."""
-    return cell.casefold() in MISSING or is_number(cell, delimiter) or _MOMENT.fullmatch(cell) is not None
+    return (
+        cell.casefold() in MISSING
+        or is_number(cell, delimiter)
+        or _MOMENT.fullmatch(cell) is not None
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +51,8 @@ class Body:
 
     @property
     def moments(self) -> list[int]:
-        """Columns of times of day, read as seconds from the first one; a date before them only says that it is one."""
+        """Columns of times of day, read as seconds from the first one; a date before them only says
+        that it is one."""
         return [j for j in range(self.width) if _MOMENT.fullmatch(self.sample[j])]
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
@@ -53,7 +61,10 @@ class Body:
         stream.seek(self.start)
         for number, line in enumerate(stream, self.first):
             if line.strip():
-                yield number, cells_of(line.decode("utf-8", errors="replace").rstrip("\n"), self.delimiter)
+                yield (
+                    number,
+                    cells_of(line.decode("utf-8", errors="replace").rstrip("\n"), self.delimiter),
+                )
 
     def place(self, row: int) -> str:
         """What messages call a row."""
@@ -66,12 +77,21 @@ class Body:
         for number, cells in self.rows():
             found = len(cells) - (len(cells) == self.width + 1 and not cells[-1])
             if found != self.width:
-                begun = re.match(rb"(Interval=)", self.data[:100]) and cells[0].startswith("Interval=")
-                remedy = "a second block begins there; save each block on its own" if begun else width_remedy(self.delimiter)
-                raise ValueError(f"{self.file}, line {number}: {found} of {self.width} columns found; {remedy}")
+                begun = re.match(rb"(Interval=)", self.data[:100]) and cells[0].startswith(
+                    "Interval="
+                )
+                remedy = (
+                    "a second block begins there; save each block on its own"
+                    if begun
+                    else width_remedy(self.delimiter)
+                )
+                raise ValueError(
+                    f"{self.file}, line {number}: {found} of {self.width} columns found; {remedy}"
+                )
 
     def _even(self) -> bool:
-        """Whether every line has as many delimiters as it should, counted in pieces of the bytes."""
+        """Whether every line has as many delimiters as it should, counted in pieces of the
+        bytes."""
         position, expected = self.start, self.width - 1 + self.trailing
         while position < len(self.data):
             end = self.data.find(b"\n", min(position + _PIECE, len(self.data)))
@@ -100,11 +120,13 @@ class Body:
         """
         if index in self.moments:
             time = self._slowly(index, name)
-            time = time + 86400 * np.cumsum(np.diff(time, prepend=time[0]) < -43200)  # past midnight
+            # past midnight
+            time = time + 86400 * np.cumsum(np.diff(time, prepend=time[0]) < -43200)
             return time - time[0]
         try:
             return self._quickly(index)
-        except (ValueError, OverflowError):  # a cell that is no number, or written in another way than the rest
+        except (ValueError, OverflowError):
+            # a cell that is no number, or written in another way than the rest
             return self._slowly(index, name)
 
     def _quickly(self, index: int) -> Float[np.ndarray, " rows"]:
@@ -113,25 +135,41 @@ class Body:
         stream = io.BytesIO(self.data)
         stream.seek(self.start)
         comma = self.delimiter != "," and any("," in cell for cell in self.sample)
-        # Before pandas 3.1 the last bit may be wrong unless it is asked for; from then on to ask is deprecated.
+        # Before pandas 3.1 the last bit may be wrong unless it is asked for; from then on to ask is
+        # deprecated.
         older = tuple(map(int, pandas.__version__.split(".")[:2])) < (3, 1)
         parts = pandas.read_csv(
-            stream, sep=self.delimiter or r"\s+", header=None, names=range(self.width + self.trailing), usecols=[index],
-            index_col=False, dtype=float, na_values=_WRITTEN, keep_default_na=False, skipinitialspace=True,
-            decimal="," if comma else ".", chunksize=_ROWS, encoding_errors="replace",
+            stream,
+            sep=self.delimiter or r"\s+",
+            header=None,
+            names=range(self.width + self.trailing),
+            usecols=[index],
+            index_col=False,
+            dtype=float,
+            na_values=_WRITTEN,
+            keep_default_na=False,
+            skipinitialspace=True,
+            decimal="," if comma else ".",
+            chunksize=_ROWS,
+            encoding_errors="replace",
             float_precision="round_trip" if older else None,
-        )  # fmt: skip
+        )
         return np.concatenate([part[index].to_numpy() for part in parts])
 
     def _slowly(self, index: int, name: str) -> Float[np.ndarray, " rows"]:
         values, value = array.array("d"), _moment if index in self.moments else number_in
         for number, cells in self.rows():
-            if len(cells) <= index:  # a quotation mark that is not closed hides the delimiters behind it
+            # a quotation mark that is not closed hides the delimiters behind it
+            if len(cells) <= index:
                 found = f"{len(cells)} of {self.width} columns found"
-                raise ValueError(f'{self.file}, line {number}: {found}; a quotation mark (") may be open')
+                raise ValueError(
+                    f'{self.file}, line {number}: {found}; a quotation mark (") may be open'
+                )
             cell = cells[index]
             try:
-                values.append(float("nan") if cell.casefold() in MISSING else value(cell, self.delimiter))
+                values.append(
+                    float("nan") if cell.casefold() in MISSING else value(cell, self.delimiter)
+                )
             except ValueError:
                 problem = f"{self.file}, line {number}: {name} {cell!r} is not a number"
                 raise ValueError(f"{problem}; leave it empty if it is not known") from None

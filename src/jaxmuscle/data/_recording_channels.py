@@ -1,11 +1,13 @@
-"""Channels of a file as the readers hand them over. Light to import: the process that reads needs nothing else."""
+"""Channels of a file as the readers hand them over. Light to import: the process that reads needs
+nothing else."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
-TYPES = ("|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f4", "<f8")  # in which samples are handed over
+# in which samples are handed over
+TYPES = ("|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f4", "<f8")
 
 
 class TooLarge(ValueError):
@@ -13,7 +15,8 @@ class TooLarge(ValueError):
 
 
 class Channel(NamedTuple):
-    """A channel: its name, samples (numbers, one dimension), rate [Hz] and unit, as far as the file states them."""
+    """A channel: its name, samples (numbers, one dimension), rate [Hz] and unit, as far as the file
+    states them."""
 
     name: str
     samples: np.ndarray
@@ -22,7 +25,8 @@ class Channel(NamedTuple):
 
 
 def distinct(channels: Iterable[Channel]) -> Iterator[Channel]:
-    """The channels with names of their own: `NAME 2` where NAME is there already, `channel 2` for a third without one."""
+    """The channels with names of their own: `NAME 2` where NAME is there already, `channel 2` for a
+    third without one."""
     known: set[str] = set()
     for number, channel in enumerate(channels):
         name = str(channel.name).strip() or f"channel {number}"
@@ -40,4 +44,6 @@ def numbers(column: Any) -> np.ndarray:
     try:
         return array.astype(float)
     except (TypeError, ValueError):
-        raise ValueError("a column holds words, not numbers; choose another one with `column`") from None
+        raise ValueError(
+            "a column holds words, not numbers; choose another one with `column`"
+        ) from None

@@ -17,7 +17,8 @@ from ._recording_table import AXES, Table, bare, find, listed, points, triple, v
 from ._recording_time import clock, sampling
 from ._units import UNITS, known_unit, quantity_of, scale_to_si
 
-FORCE = re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?")  # what a column of force is called
+# what a column of force is called
+FORCE = re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?")
 
 
 class _Choice(NamedTuple):
@@ -39,11 +40,18 @@ class Reading(NamedTuple):
     lever_arm: float | int | None = None
 
 
-def recording_of(make: Callable[..., Any], table: Table, reading: Reading, name: str | None = None) -> Any:
+def recording_of(
+    make: Callable[..., Any], table: Table, reading: Reading, name: str | None = None
+) -> Any:
     """What `make`, the class of a recording, makes of a column, called `name` or as its file."""
     column, rate, units, axis, reference, time, max_gap, lever_arm = reading
     require(axis in (None, *AXES, "principal"), "axis", axis, "choose one of x, y, z, principal")
-    require(isinstance(max_gap, int | float) and 0 <= max_gap < math.inf, "max_gap", max_gap, "give a time in s")
+    require(
+        isinstance(max_gap, int | float) and 0 <= max_gap < math.inf,
+        "max_gap",
+        max_gap,
+        "give a time in s",
+    )
     times = clock(table, time)
     chosen = _chosen(table, column, axis, reference, None if times is None else times.name)
     signal = values(table, chosen.columns)
@@ -55,13 +63,23 @@ def recording_of(make: Callable[..., Any], table: Table, reading: Reading, name:
     if lever_arm is not None:
         signal, unit = _as_force(table, chosen.name, signal, unit, lever_arm, notices)
     file = Path(table.file)
-    words = [file.name, f"column {chosen.name}" if axis is None else f"point {chosen.name}, axis {axis}"]
+    words = [
+        file.name,
+        f"column {chosen.name}" if axis is None else f"point {chosen.name}, axis {axis}",
+    ]
     words += [f"minus {reference}"] * (reference is not None) + [f"{found:.6g} Hz"]
     try:
         whole, start, closed = filled(signal, found, float(max_gap))
         samples = whole[:, 0] if whole.shape[1] == 1 else _principal(whole)
-        return make(samples, found, unit=unit, name=name or printable(file.stem), source=printable(", ".join(words)),
-                    start=start, notices=(*notices, *closed))  # fmt: skip
+        return make(
+            samples,
+            found,
+            unit=unit,
+            name=name or printable(file.stem),
+            source=printable(", ".join(words)),
+            start=start,
+            notices=(*notices, *closed),
+        )
     except ValueError as error:
         raise ValueError(f"{table.file}: column {chosen.name}: {error}") from None
 
@@ -74,36 +92,55 @@ def perturbed_of(
     displacement_units: str | None,
     **options: Any,
 ) -> Any:
-    """What `make` makes of the columns of force and displacement, by name of the role; gaps are closed in both alike."""
+    """What `make` makes of the columns of force and displacement, by name of the role; gaps are
+    closed in both alike."""
     times = clock(table, reading.time)
     names = {role: find(table, column, role) for role, column in columns.items()}
     for role, name in names.items():
         if times is not None and name == times.name:
             others = listed(_others(table, name))
-            raise ValueError(f"{table.file}: {role}={columns[role]!r} is the time; choose one of {others}")
+            raise ValueError(
+                f"{table.file}: {role}={columns[role]!r} is the time; choose one of {others}"
+            )
     force, displacement = names.values()
     if force == displacement or table.rates.get(force) != table.rates.get(displacement):
         fault = "are one column" if force == displacement else "have different rates; resample one"
-        raise ValueError(f"{table.file}: force={columns['force']!r} and displacement={columns['displacement']!r} {fault}")
+        raise ValueError(
+            f"{table.file}: force={columns['force']!r} and displacement={columns['displacement']!r}"
+            f" {fault}"
+        )
     signal = values(table, names.values())
     found, notices = sampling(table, force, times, signal.shape[0], reading.rate)
     units = _unit(table, _Choice(force, [force]), reading.units, None, notices)
     moved = table.units.get(displacement) if displacement_units is None else displacement_units
     if moved is None:
-        raise ValueError(f"{table.file}: does not say in which unit {displacement} is; give `displacement_units`, as "
-                         "displacement_units='mm'; or, if nothing moved the insertion, the force alone, as "
-                         "`column`")  # fmt: skip
+        raise ValueError(
+            f"{table.file}: does not say in which unit {displacement} is; give"
+            " `displacement_units`, as displacement_units='mm'; or, if nothing moved the"
+            " insertion, the force alone, as `column`"
+        )
     file = Path(table.file)
     source = f"{file.name}, columns {force} and {displacement}, {found:.6g} Hz"
     try:
         whole, start, closed = filled(signal, found, float(reading.max_gap))
-        return make(*whole.T, found, units=units, displacement_units=moved, name=printable(file.stem), start=start,
-                    source=printable(source), notices=(*notices, *closed), **options)  # fmt: skip
+        return make(
+            *whole.T,
+            found,
+            units=units,
+            displacement_units=moved,
+            name=printable(file.stem),
+            start=start,
+            source=printable(source),
+            notices=(*notices, *closed),
+            **options,
+        )
     except ValueError as error:
         raise ValueError(f"{table.file}: {error}") from None
 
 
-def _as_force(table: Table, name: str, signal: Any, unit: str, lever_arm: Any, notices: list[str]) -> tuple[Any, str]:
+def _as_force(
+    table: Table, name: str, signal: Any, unit: str, lever_arm: Any, notices: list[str]
+) -> tuple[Any, str]:
     """A torque over its lever arm, in N."""
     try:
         remedy = f"leave it out: it turns a torque into a force, and column {name} is in {unit}"
@@ -111,7 +148,9 @@ def _as_force(table: Table, name: str, signal: Any, unit: str, lever_arm: Any, n
         scale, _ = scale_to_si(unit, "units", "force", lever_arm)
     except ValueError as error:
         raise ValueError(f"{table.file}: {error}") from None
-    notices.append(f"the torque in {unit} was divided by the lever arm of {float(lever_arm):g} m: a force in N")
+    notices.append(
+        f"the torque in {unit} was divided by the lever arm of {float(lever_arm):g} m: a force in N"
+    )
     return scale * signal, "N"
 
 
@@ -122,7 +161,11 @@ def signals(table: Table, time: str | int | None) -> list[str]:
 
 
 def _chosen(
-    table: Table, column: str | int | None, axis: str | None, reference: str | int | None, time: str | None
+    table: Table,
+    column: str | int | None,
+    axis: str | None,
+    reference: str | int | None,
+    time: str | None,
 ) -> _Choice:
     """The column, or the columns of the point of which an axis is asked."""
     if axis is not None:
@@ -130,21 +173,35 @@ def _chosen(
     if column is not None:
         name = find(table, column)
         if name == time and len(table.columns) > 1:
-            raise ValueError(f"{table.file}: column {column!r} is the time; choose one of {listed(_others(table, time))}")
+            raise ValueError(
+                f"{table.file}: column {column!r} is the time; choose one of"
+                f" {listed(_others(table, time))}"
+            )
         return _Choice(name, [name])
     others = _others(table, time)
     if reference is not None:
         others = [name for name in others if name != find(table, reference, "reference")]
     if len(others) > 1:
-        forces = [name for name in others if quantity_of(table.units.get(name, "")) in ("force", "torque")]
-        forces = forces if len(forces) == 1 else [name for name in forces or others if FORCE.fullmatch(bare(name))]
+        forces = [
+            name for name in others if quantity_of(table.units.get(name, "")) in ("force", "torque")
+        ]
+        forces = (
+            forces
+            if len(forces) == 1
+            else [name for name in forces or others if FORCE.fullmatch(bare(name))]
+        )
         if len(forces) == 1:
             return _Choice(
-                forces[0], forces, f"column {forces[0]} taken, of {listed(others)}" + _moved(table, others, forces[0])
+                forces[0],
+                forces,
+                f"column {forces[0]} taken, of {listed(others)}" + _moved(table, others, forces[0]),
             )
     if len(others) != 1:
         which = listed(others) or "none"
-        raise ValueError(f"{table.file}: holds {len(others)} columns besides the time; choose one with `column`: {which}")
+        raise ValueError(
+            f"{table.file}: holds {len(others)} columns besides the time; choose one with `column`:"
+            f" {which}"
+        )
     return _Choice(others[0], others)
 
 
@@ -153,28 +210,42 @@ def _others(table: Table, time: str | None) -> list[str]:
 
 
 def _moved(table: Table, others: list[str], force: str) -> str:
-    """What to say where a column is a displacement: the answer to a motor is no fluctuation of a hold."""
-    moving = [name for name in others if quantity_of(table.units.get(name, "")) in ("displacement", "angle")]
+    """What to say where a column is a displacement: the answer to a motor is no fluctuation of a
+    hold."""
+    moving = [
+        name
+        for name in others
+        if quantity_of(table.units.get(name, "")) in ("displacement", "angle")
+    ]
     if not moving:
         return ""
-    return (f". If a motor moved the muscle ({moving[0]}), give both channels: --force-column {force} --displacement "
-            f"{moving[0]} (Python: force=, displacement=). Else the answer to the motor counts as unsteadiness")  # fmt: skip
+    return (
+        f". If a motor moved the muscle ({moving[0]}), give both channels: --force-column {force}"
+        f" --displacement {moving[0]} (Python: force=, displacement=). Else the answer to the motor"
+        " counts as unsteadiness"
+    )
 
 
-def _point(table: Table, column: str | int | None, axis: str, reference: str | int | None, time: str | None) -> _Choice:
+def _point(
+    table: Table, column: str | int | None, axis: str, reference: str | int | None, time: str | None
+) -> _Choice:
     known, others = points(table), _others(table, time)
     if column is None:
         stems = [stem for stem in known if reference is None or stem != str(reference).casefold()]
         if not known and len(others) == 3:
             return _Choice("the three columns", _axis(others, axis))
         if len(stems) != 1:
-            raise ValueError(f"{table.file}: holds {len(stems)} points; choose one with `column`: {listed(stems) or 'none'}")
+            raise ValueError(
+                f"{table.file}: holds {len(stems)} points; choose one with `column`:"
+                f" {listed(stems) or 'none'}"
+            )
         column = stems[0]
     columns = triple(table, str(column))
     if columns is None:
         have = f"known are the points {listed(known)}" if known else "there are no points"
         raise ValueError(
-            f"{table.file}: axis={axis!r} needs a point, three columns as {column}_x, {column}_y, {column}_z; {have}"
+            f"{table.file}: axis={axis!r} needs a point, three columns as {column}_x, {column}_y,"
+            f" {column}_z; {have}"
         )
     return _Choice(str(column), _axis(columns, axis))
 
@@ -183,7 +254,9 @@ def _axis(columns: list[str], axis: str) -> list[str]:
     return columns if axis == "principal" else [columns[AXES.index(axis)]]
 
 
-def _reference(table: Table, reference: str | int, axis: str | None, shape: tuple[int, ...]) -> list[str]:
+def _reference(
+    table: Table, reference: str | int, axis: str | None, shape: tuple[int, ...]
+) -> list[str]:
     columns = None if axis is None else triple(table, str(reference))
     if columns is not None and axis is not None:
         names = _axis(columns, axis)
@@ -194,11 +267,15 @@ def _reference(table: Table, reference: str | int, axis: str | None, shape: tupl
         raise ValueError(f"{table.file}: no point {reference!r} as reference; known points: {have}")
     rows = values(table, names).shape[0]
     if rows != shape[0]:
-        raise ValueError(f"{table.file}: reference={reference!r} has {rows} samples, the column {shape[0]}")
+        raise ValueError(
+            f"{table.file}: reference={reference!r} has {rows} samples, the column {shape[0]}"
+        )
     return names
 
 
-def _unit(table: Table, chosen: _Choice, units: str | None, axis: str | None, notices: list[str]) -> str:
+def _unit(
+    table: Table, chosen: _Choice, units: str | None, axis: str | None, notices: list[str]
+) -> str:
     stated = table.units.get(chosen.columns[0])
     if units is not None:
         require(known_unit(units) is not None, "units", units, choices(units, UNITS))
@@ -208,9 +285,15 @@ def _unit(table: Table, chosen: _Choice, units: str | None, axis: str | None, no
     if stated is not None and known_unit(stated) is not None:
         return stated
     if axis is not None:
-        raise ValueError(f"{table.file}: does not say in which unit {chosen.name} is; give `units`, as units='mm'")
+        raise ValueError(
+            f"{table.file}: does not say in which unit {chosen.name} is; give `units`, as"
+            " units='mm'"
+        )
     if stated is not None:
-        raise ValueError(f"{table.file}: column {chosen.name}: unknown unit {stated!r}; give `units`, as units='N'")
+        raise ValueError(
+            f"{table.file}: column {chosen.name}: unknown unit {stated!r}; give `units`, as"
+            " units='N'"
+        )
     notices.append("no unit stated: taken as N")
     return "N"
 

@@ -1,4 +1,5 @@
-"""Recordings in binary files: MATLAB (.mat, also v7.3), NumPy (.npy, .npz) and C3D. Run by `_apart_child` alone."""
+"""Recordings in binary files: MATLAB (.mat, also v7.3), NumPy (.npy, .npz) and C3D. Run by
+`_apart_child` alone."""
 
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,34 +20,43 @@ def read_npy(path: str, most: int) -> list[Channel]:
 
 
 def read_npz(path: str, most: int) -> list[Channel]:
-    """Several arrays by name, `NAME:0`, `NAME:1`, ... if they have columns; a scalar `fs` or `rate` is the rate."""
+    """Several arrays by name, `NAME:0`, `NAME:1`, ... if they have columns; a scalar `fs` or `rate`
+    is the rate."""
     unpacked(path, most)
     with np.load(path, allow_pickle=False) as arrays:
         return _channels(dict(arrays))
 
 
 def unpacked(path: str, most: int) -> None:
-    """Raise `TooLarge` for a zip archive whose files together say that they are larger than `most` bytes."""
+    """Raise `TooLarge` for a zip archive whose files together say that they are larger than `most`
+    bytes."""
     with zipfile.ZipFile(path) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > most:
             raise TooLarge
 
 
 def read_mat(path: str, most: int) -> list[Channel]:
-    """MATLAB's variables by name; fields of structs as `trial.force`, columns as `Data:74` (MATLAB's Data(:, 75))."""
+    """MATLAB's variables by name; fields of structs as `trial.force`, columns as `Data:74`
+    (MATLAB's Data(:, 75))."""
     import scipy.io
 
     try:
         content = scipy.io.loadmat(path, simplify_cells=True)
     except NotImplementedError:
         return _channels(_hdf5(path, most))
-    return _channels(dict(_flat({key: value for key, value in content.items() if not key.startswith("__")})))
+    return _channels(
+        dict(_flat({key: value for key, value in content.items() if not key.startswith("__")}))
+    )
 
 
 def _flat(content: Mapping[str, Any], stem: str = "") -> Iterable[tuple[str, Any]]:
     """Numbers in nested structs, and those in a cell that holds nothing else."""
     for key, value in content.items():
-        while isinstance(value, np.ndarray | list) and np.size(value) == 1 and np.asarray(value).dtype == object:
+        while (
+            isinstance(value, np.ndarray | list)
+            and np.size(value) == 1
+            and np.asarray(value).dtype == object
+        ):
             value = np.asarray(value).item()
         if isinstance(value, Mapping):
             yield from _flat(value, f"{stem}{key}.")
@@ -65,10 +75,18 @@ def _hdf5(path: str, most: int) -> dict[str, np.ndarray]:
             if isinstance(item, h5py.Group) and _leads_out(item, h5py.ExternalLink):
                 raise ValueError(ABROAD)
             for _ in range(REFERENCES):
-                if not isinstance(item, h5py.Dataset) or item.dtype != h5py.ref_dtype or item.size != 1:
+                if (
+                    not isinstance(item, h5py.Dataset)
+                    or item.dtype != h5py.ref_dtype
+                    or item.size != 1
+                ):
                     break
                 item = file[np.asarray(item).item()]
-            if not isinstance(item, h5py.Dataset) or name.startswith("#") or "MATLAB_empty" in item.attrs:
+            if (
+                not isinstance(item, h5py.Dataset)
+                or name.startswith("#")
+                or "MATLAB_empty" in item.attrs
+            ):
                 return
             if item.dtype.kind in "iuf" and item.attrs.get("MATLAB_class") != b"char":
                 if item.external or item.is_virtual:
@@ -87,7 +105,8 @@ def _leads_out(group: Any, kind: type) -> bool:
 
 
 def _channels(arrays: Mapping[str, Any]) -> list[Channel]:
-    """Columns of all numeric arrays with one or two dimensions; a two-dimensional one has its samples along the longer."""
+    """Columns of all numeric arrays with one or two dimensions; a two-dimensional one has its
+    samples along the longer."""
     found: list[Channel] = []
     rate = None
     for name, value in arrays.items():
@@ -96,7 +115,11 @@ def _channels(arrays: Mapping[str, Any]) -> list[Channel]:
             continue
         if array.size == 1 and name.rpartition(".")[2].casefold() in RATES:
             rate = float(array.item())
-        array = array.reshape(-1, 1) if array.ndim < 2 or array.shape in ((1, array.size), (array.size, 1)) else array
+        array = (
+            array.reshape(-1, 1)
+            if array.ndim < 2 or array.shape in ((1, array.size), (array.size, 1))
+            else array
+        )
         if array.ndim == 2 and array.shape[0] >= 2 and array.shape[1]:
             found += _columns(name, array.T if array.shape[0] < array.shape[1] else array)
     if not found:
@@ -111,7 +134,8 @@ def _columns(name: str, array: np.ndarray) -> Iterator[Channel]:
 
 
 def read_c3d(path: str, most: int) -> list[Channel]:
-    """Points as `NAME_x`, `NAME_y`, `NAME_z` and analog channels by name; a negative residual is a gap.
+    """Points as `NAME_x`, `NAME_y`, `NAME_z` and analog channels by name; a negative residual is a
+    gap.
 
     **Raises:** `ImportError` that says what to install.
     """
@@ -128,7 +152,8 @@ def read_c3d(path: str, most: int) -> list[Channel]:
     unit = _first(point, "UNITS", 0)
     for i, label in enumerate(_labels(point, xyz.shape[1])):
         found += [
-            Channel(f"{label}_{axis}", values, _rate(point), unit) for axis, values in zip("xyz", xyz[:, i], strict=True)
+            Channel(f"{label}_{axis}", values, _rate(point), unit)
+            for axis, values in zip("xyz", xyz[:, i], strict=True)
         ]
     channels = np.asarray(content["data"]["analogs"])[0]
     for i, label in enumerate(_labels(analog, len(channels))):

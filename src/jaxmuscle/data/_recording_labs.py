@@ -1,5 +1,5 @@
-"""Recordings as laboratories save them: Excel, EDF, TDMS, AcqKnowledge, Spike2, by the libraries for them. Run by
-`_apart_child` alone."""
+"""Recordings as laboratories save them: Excel, EDF, TDMS, AcqKnowledge, Spike2, by the libraries
+for them. Run by `_apart_child` alone."""
 
 import importlib
 from typing import Any
@@ -25,7 +25,9 @@ def read_xlsx(path: str, most: int) -> bytes:
     sheet = pandas.read_excel(path, header=None, engine="openpyxl")
     if sheet.empty:
         raise ValueError("its first sheet is empty")
-    return sheet.replace(r"\s+", " ", regex=True).to_csv(sep="\t", header=False, index=False).encode()
+    return (
+        sheet.replace(r"\s+", " ", regex=True).to_csv(sep="\t", header=False, index=False).encode()
+    )
 
 
 def read_edf(path: str, most: int) -> list[Channel]:
@@ -34,11 +36,15 @@ def read_edf(path: str, most: int) -> list[Channel]:
     with open(path, "rb") as file:
         read = library.read_bdf if file.read(1) == b"\xff" else library.read_edf
     signals = read(path, header_encoding="latin-1").signals  # though the format allows ASCII alone
-    return [Channel(each.label, each.data, each.sampling_frequency, each.physical_dimension) for each in signals]
+    return [
+        Channel(each.label, each.data, each.sampling_frequency, each.physical_dimension)
+        for each in signals
+    ]
 
 
 def read_tdms(path: str, most: int) -> list[Channel]:
-    """TDMS: channels by name, as `GROUP/NAME` where several groups have it; the rate is that of the waveform."""
+    """TDMS: channels by name, as `GROUP/NAME` where several groups have it; the rate is that of the
+    waveform."""
     groups = _library("nptdms").TdmsFile.read(path).groups()
     found = [(group.name, channel) for group in groups for channel in group.channels()]
     names = [channel.name for _, channel in found]
@@ -66,6 +72,11 @@ def read_smr(path: str, most: int) -> list[Channel]:
     channels: list[Channel] = []
     for group in blocks[0].analogsignals:
         names = group.array_annotations.get("channel_names", [group.name])
-        rate, unit = float(group.sampling_rate.rescale("Hz").magnitude), str(group.units.dimensionality)
-        channels += [Channel(str(name), group.magnitude[:, i], rate, unit) for i, name in enumerate(names)]
+        rate, unit = (
+            float(group.sampling_rate.rescale("Hz").magnitude),
+            str(group.units.dimensionality),
+        )
+        channels += [
+            Channel(str(name), group.magnitude[:, i], rate, unit) for i, name in enumerate(names)
+        ]
     return channels

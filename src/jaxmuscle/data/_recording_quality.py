@@ -22,8 +22,9 @@ class RecordingSummary(Printed, eqx.Module):
     """Numbers of a window.
 
     Its `duration` [s] and Welch `segments`; `mean` and `standard_deviation` in `unit`; without unit
-    `coefficient_of_variation`, its inverse `signal_to_noise`, `approximate_entropy` and `sample_entropy` (m = 2,
-    r = 0.2 σ); `peaks` of the spectrum: its `maximum`, and its `local_maxima` by rising frequency.
+    `coefficient_of_variation`, its inverse `signal_to_noise`, `approximate_entropy` and
+    `sample_entropy` (m = 2, r = 0.2 σ); `peaks` of the spectrum: its `maximum`, and its
+    `local_maxima` by rising frequency.
     """
 
     unit: str
@@ -46,7 +47,10 @@ class RecordingSummary(Printed, eqx.Module):
             ("Welch segments", f"{self.segments}"),
             (f"mean ({self.unit})", f"{self.mean:.4g}"),
             (f"standard deviation ({self.unit})", f"{self.standard_deviation:.4g}"),
-            ("coefficient of variation (%)", f"{100 * variation:.3g}" if variation < 10 else "none, the mean is near zero"),
+            (
+                "coefficient of variation (%)",
+                f"{100 * variation:.3g}" if variation < 10 else "none, the mean is near zero",
+            ),
             ("mean over SD (signal-to-noise)", f"{self.signal_to_noise:.4g}"),
             ("approximate entropy", f"{self.approximate_entropy:.4f}"),
             ("sample entropy", f"{self.sample_entropy:.4f}"),
@@ -63,10 +67,22 @@ class RecordingSummary(Printed, eqx.Module):
 
         `quantity`, `value`, `unit`; of the peaks the frequency of the maximum, called `maximum`.
         """
-        units = {"duration": "s", "mean": self.unit, "standard_deviation": self.unit, "maximum": "Hz"}
-        numbers = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)[1:-1]}
+        units = {
+            "duration": "s",
+            "mean": self.unit,
+            "standard_deviation": self.unit,
+            "maximum": "Hz",
+        }
+        numbers = {
+            field.name: getattr(self, field.name) for field in dataclasses.fields(self)[1:-1]
+        }
         numbers["maximum"] = self.peaks.maximum.interpolated
-        return frame([{"quantity": n, "value": float(v), "unit": units.get(n, "1")} for n, v in numbers.items()])
+        return frame(
+            [
+                {"quantity": n, "value": float(v), "unit": units.get(n, "1")}
+                for n, v in numbers.items()
+            ]
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The same for JSON, with `None` for what is not finite."""
@@ -91,7 +107,8 @@ def filled(
 
     **Arguments:** `values`; sampling `rate` [Hz]; the `longest` gap that is closed [s].
 
-    **Returns:** the rows without gaps, the time of the first one [s] (0 if nothing was cut off), what was done in sentences.
+    **Returns:** the rows without gaps, the time of the first one [s] (0 if nothing was cut off),
+    what was done in sentences.
 
     **Raises:** `ValueError` if nothing is there or a gap is longer, naming its times.
     """
@@ -118,12 +135,16 @@ def filled(
             part[hole] = np.interp(index[hole], index[~hole], part[~hole])
         widest = np.max(gaps[:, 1] - gaps[:, 0]) / rate
         plural = "s" if len(gaps) > 1 else ""
-        notices.append(f"{len(gaps)} gap{plural} ({hole.sum()} samples, longest {widest:.3g} s) closed by straight lines")
+        notices.append(
+            f"{len(gaps)} gap{plural} ({hole.sum()} samples, longest {widest:.3g} s) closed by"
+            " straight lines"
+        )
     return values, begin, notices
 
 
 def clipping(x: Float[np.ndarray, " times"], rate: float, start: float) -> list[str]:
-    """A sentence for each extreme at which the signal stays flat for 20 ms and 5 samples or more."""
+    """A sentence for each extreme at which the signal stays flat for 20 ms and 5 samples or
+    more."""
     shortest, notices = max(FLAT[0] * rate, FLAT[1]), []
     for word, extreme in (("highest", x.max()), ("lowest", x.min())):
         flat = runs(x == extreme)
@@ -132,8 +153,8 @@ def clipping(x: Float[np.ndarray, " times"], rate: float, start: float) -> list[
             share = np.mean(x == extreme)
             first = start + flat[0, 0] / rate
             notices.append(
-                f"flat at its {word} value {extreme:.6g} for {100 * share:.2g} % of the samples, first at "
-                f"{first:.3f} s: clipped by the amplifier?"
+                f"flat at its {word} value {extreme:.6g} for {100 * share:.2g} % of the samples,"
+                f" first at {first:.3f} s: clipped by the amplifier?"
             )
     return notices
 
@@ -148,13 +169,15 @@ def _size(x: Float[np.ndarray, " times"], rate: float) -> int:
 
 
 def plateau(x: Float[np.ndarray, " times"], rate: float) -> tuple[int, int] | None:
-    """The steady part of a ramp-and-hold, as the index of its first sample and of the first one after it.
+    """The steady part of a ramp-and-hold, as the index of its first sample and of the first one
+    after it.
 
-    s is the running median over 1 s; rest is the extreme of s nearer to zero, and the level L is the median of s
-    where it is more than half-way from rest to the other extreme. The plateau is the longest stretch with
-    |s - L| <= 0.1 |L - rest|, if it makes up at least half of the time beyond half-way (a slow ramp, a sine or several
-    holds do not); one second is taken off where it borders on something else. If s ranges over no more than 0.2 of
-    its largest absolute value there is no ramp, and all of it is steady.
+    s is the running median over 1 s; rest is the extreme of s nearer to zero, and the level L is
+    the median of s where it is more than half-way from rest to the other extreme. The plateau is
+    the longest stretch with |s - L| <= 0.1 |L - rest|, if it makes up at least half of the time
+    beyond half-way (a slow ramp, a sine or several holds do not); one second is taken off where it
+    borders on something else. If s ranges over no more than 0.2 of its largest absolute value there
+    is no ramp, and all of it is steady.
 
     **Returns:** the two indices, or `None` if there is no such stretch.
     """
@@ -176,17 +199,28 @@ def plateau(x: Float[np.ndarray, " times"], rate: float) -> tuple[int, int] | No
 
 
 def checked(samples: Any, rate: float, start: float) -> Float[np.ndarray, " all"]:
-    """The samples as a copy that cannot be changed. **Raises:** `ValueError` if they are no signal."""
+    """The samples as a copy that cannot be changed. **Raises:** `ValueError` if they are no
+    signal."""
     try:
         x = np.array(samples, dtype=float)
     except (TypeError, ValueError):
         raise ValueError("samples: give real numbers, one for each time") from None
-    require(x.ndim == 1 and x.size >= 2, "samples shape", x.shape, "give one signal of 2 samples or more")
+    require(
+        x.ndim == 1 and x.size >= 2,
+        "samples shape",
+        x.shape,
+        "give one signal of 2 samples or more",
+    )
     wrong = np.flatnonzero(~(np.abs(x) < 1e100))
     if wrong.size:
         first = f"the first at {start + wrong[0] / rate:.3f} s ({x[wrong[0]]:g})"
-        raise ValueError(f"samples: {wrong.size} are no finite numbers, {first}; `load_recording` closes short gaps of NaN")
+        raise ValueError(
+            f"samples: {wrong.size} are no finite numbers, {first}; `load_recording` closes short"
+            " gaps of NaN"
+        )
     if np.ptp(x) <= 1e-12 * np.max(np.abs(x)):
-        raise ValueError(f"samples: constant at {x[0]:g}; is this the right column, was the sensor connected?")
+        raise ValueError(
+            f"samples: constant at {x[0]:g}; is this the right column, was the sensor connected?"
+        )
     x.setflags(write=False)
     return x

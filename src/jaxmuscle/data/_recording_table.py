@@ -26,9 +26,9 @@ AXES = ("x", "y", "z")
 class Table(NamedTuple):
     """Columns of a file by name.
 
-    `columns` are functions, so that only those that are asked for are read; `named` is false where names are only
-    numbers; `rates` [Hz] and `units` by column, where the file states them; `words` are columns that hold no numbers;
-    `place` is how messages call a row.
+    `columns` are functions, so that only those that are asked for are read; `named` is false where
+    names are only numbers; `rates` [Hz] and `units` by column, where the file states them; `words`
+    are columns that hold no numbers; `place` is how messages call a row.
     """
 
     file: str
@@ -42,27 +42,46 @@ class Table(NamedTuple):
 
 def channels_table(file: str, channels: Sequence[Channel], *, named: bool = True) -> Table:
     """The channels that a reader found in a file."""
-    columns = {channel.name: functools.partial(np.asarray, channel.samples, dtype=float) for channel in channels}
+    columns = {
+        channel.name: functools.partial(np.asarray, channel.samples, dtype=float)
+        for channel in channels
+    }
     rates = {channel.name: channel.rate for channel in channels if channel.rate is not None}
-    return Table(file, columns, named, rates, {channel.name: channel.unit for channel in channels if channel.unit})
+    return Table(
+        file,
+        columns,
+        named,
+        rates,
+        {channel.name: channel.unit for channel in channels if channel.unit},
+    )
 
 
 def frame_table(frame: Any) -> Table:
-    """The columns of a pandas table, its index before them if that is more than a counter; times become seconds.
+    """The columns of a pandas table, its index before them if that is more than a counter; times
+    become seconds.
 
     **Raises:** `ValueError` if it is no such table.
     """
     if not hasattr(frame, "columns"):
-        raise ValueError(f"frame={type(frame).__name__}: give a pandas DataFrame, a single column as frame.to_frame()")
+        raise ValueError(
+            f"frame={type(frame).__name__}: give a pandas DataFrame, a single column as"
+            " frame.to_frame()"
+        )
     index = frame.index
     counter = index.dtype.kind not in "fmM" and index.name is None
     given = [] if counter else [(str(index.name or "time"), index)]
-    given += [(" ".join(map(str, key)) if isinstance(key, tuple) else str(key), frame.iloc[:, i])
-              for i, key in enumerate(frame.columns)]  # fmt: skip
+    given += [
+        (" ".join(map(str, key)) if isinstance(key, tuple) else str(key), frame.iloc[:, i])
+        for i, key in enumerate(frame.columns)
+    ]
     names = [name for name, _ in given]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None or frame.empty:
-        raise ValueError("the table is empty" if frame.empty else f"the table has two columns {twice!r}; rename one")
+        raise ValueError(
+            "the table is empty"
+            if frame.empty
+            else f"the table has two columns {twice!r}; rename one"
+        )
     columns = {name: lambda column=column: numbers(column.to_numpy()) for name, column in given}
     kinds = {name: column.dtype.kind for name, column in given}
     units = units_of(names) | {name: "s" for name, kind in kinds.items() if kind in "mM"}
@@ -86,12 +105,15 @@ def listed(names: Iterable[str]) -> str:
     for name in names:
         stem, _, index = name.rpartition(":")
         groups.setdefault(stem if stem and index.isdigit() else name, []).append(name)
-    short = [group[0] if len(group) == 1 else f"{group[0]} to {group[-1]}" for group in groups.values()]
+    short = [
+        group[0] if len(group) == 1 else f"{group[0]} to {group[-1]}" for group in groups.values()
+    ]
     return ", ".join(short[:30]) + (f" ... ({len(short)} in all)" if len(short) > 30 else "")
 
 
 def find(table: Table, column: str | int, argument: str = "column") -> str:
-    """The name of the column that is meant: by name (case and bracketed unit may be left out) or number from 0.
+    """The name of the column that is meant: by name (case and bracketed unit may be left out) or
+    number from 0.
 
     **Raises:** `ValueError` with the nearest name and all names.
     """
@@ -102,11 +124,13 @@ def find(table: Table, column: str | int, argument: str = "column") -> str:
     stem = str(column).casefold()
     if triple(table, str(column)) is not None:
         raise ValueError(
-            f"{table.file}: {argument}={column!r} is a point of three columns; give axis='x', 'y', 'z' or 'principal'"
+            f"{table.file}: {argument}={column!r} is a point of three columns; give axis='x', 'y',"
+            " 'z' or 'principal'"
         )
     if any(name.casefold() == f"{stem}:0" for name in names):
         raise ValueError(
-            f"{table.file}: {argument}={column!r} has several columns; choose one, as {column}:0 (counted from 0)"
+            f"{table.file}: {argument}={column!r} has several columns; choose one, as {column}:0"
+            " (counted from 0)"
         )
     near = difflib.get_close_matches(str(column), names, n=1, cutoff=0.4)
     hint = f"did you mean {near[0]!r}? " if near else ""
@@ -148,7 +172,11 @@ def points(table: Table) -> list[str]:
         for first, _, _ in TRIPLES:
             stem = name.removesuffix(first)
             # NAME_x ends in x as well, but its point is NAME.
-            if stem != name and stem[-1:] not in ("", "_", ".", ":", " ") and triple(table, stem) is not None:
+            if (
+                stem != name
+                and stem[-1:] not in ("", "_", ".", ":", " ")
+                and triple(table, stem) is not None
+            ):
                 found[stem] = None
     return list(found)
 
@@ -167,6 +195,7 @@ def values(table: Table, names: Iterable[str]) -> Float[np.ndarray, "rows column
         wrong = np.flatnonzero(np.isinf(part))
         if wrong.size:
             raise ValueError(
-                f"{table.file}, {table.place(int(wrong[0]))}: {name} is infinite; leave it empty if it is not known"
+                f"{table.file}, {table.place(int(wrong[0]))}: {name} is infinite; leave it empty if"
+                " it is not known"
             )
     return np.stack(parts, axis=1)

@@ -1,4 +1,5 @@
-"""The classical description of a dynamic stiffness: a spring, a damper and a mass, with or without a pure delay."""
+"""The classical description of a dynamic stiffness: a spring, a damper and a mass, with or without
+a pure delay."""
 
 from typing import NamedTuple
 
@@ -9,18 +10,22 @@ from jaxtyping import Complex, Float
 from jaxmuscle.spectra._cross_spectrum import Response
 from jaxmuscle.spectra._settings import require
 
-SURE, WORSE = 4.0, 2.0  # a delay that is told of: in standard errors, and chi² without it over chi² with it
+# a delay that is told of: in standard errors, and chi² without it over chi² with it
+SURE, WORSE = 4.0, 2.0
 
 
 class SecondOrder(NamedTuple):
-    """`value` and `stderr` of K [N/m], B [N s/m], I [kg] and, if fitted, of the delay τ [s]; chi² over its expectation."""
+    """`value` and `stderr` of K [N/m], B [N s/m], I [kg] and, if fitted, of the delay τ [s]; chi²
+    over its expectation."""
 
     value: Float[np.ndarray, " parameters"]
     stderr: Float[np.ndarray, " parameters"]
     chi2: float
 
 
-def second_order_shape(frequency: Float[np.ndarray, " bins"], parameters: Float[np.ndarray, " parameters"]) -> np.ndarray:
+def second_order_shape(
+    frequency: Float[np.ndarray, " bins"], parameters: Float[np.ndarray, " parameters"]
+) -> np.ndarray:
     """H = (K + iωB - ω²I) e^{-iωτ} [N/m], ω = 2πf; τ = 0 if there are three parameters."""
     k, b, i, *delay = parameters
     s = 2j * np.pi * frequency
@@ -30,12 +35,17 @@ def second_order_shape(frequency: Float[np.ndarray, " bins"], parameters: Float[
 def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     """K, B and I, and a delay, by least squares weighted with the response's errors.
 
-    The errors take the correlation of neighbouring bins into account. Where chi² is more than it should be, since the muscle
-    has another shape, they are multiplied by √(chi² / its expectation).
+    The errors take the correlation of neighbouring bins into account. Where chi² is more than it
+    should be, since the muscle has another shape, they are multiplied by √(chi² / its expectation).
     """
     f, weight = response.centre, 1 / np.concatenate([response.stderr] * 2)
     count = 3 + delayed
-    require(2 * f.size > count, "bins", f.size, "too few for a fit; excite a wider band, or take longer segments")
+    require(
+        2 * f.size > count,
+        "bins",
+        f.size,
+        "too few for a fit; excite a wider band, or take longer segments",
+    )
     scale, shapes = _terms(response)
     scale = np.append(scale, 1 / (2 * np.pi * f.max()))[:count]
 
@@ -43,7 +53,9 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
         return parts(second_order_shape(f, x * scale) - response.value) * weight
 
     start = np.linalg.lstsq(shapes, parts(response.value) * weight)[0]
-    found = scipy.optimize.least_squares(residuals, np.append(start, 0.0)[:count], x_scale="jac", jac="3-point")
+    found = scipy.optimize.least_squares(
+        residuals, np.append(start, 0.0)[:count], x_scale="jac", jac="3-point"
+    )
     inverse = np.linalg.pinv(found.jac.T @ found.jac)
     c = response.correlation
     covariance = np.block([[np.real(c), -np.imag(c)], [np.imag(c), np.real(c)]])
@@ -54,7 +66,8 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
 
 
 def lateness(response: Response) -> list[str]:
-    """A notice if the force is surely later or earlier than a spring, a damper and a mass explain, else nothing."""
+    """A notice if the force is surely later or earlier than a spring, a damper and a mass explain,
+    else nothing."""
     if 2 * response.centre.size <= 4:
         return []
     without, found = (second_order_fit(response, delayed) for delayed in (False, True))
@@ -62,18 +75,25 @@ def lateness(response: Response) -> list[str]:
     if abs(delay) < SURE * error or without.chi2 < WORSE * found.chi2:
         return []
     by, when = f"{1e3 * abs(delay):.2g} ± {1e3 * error:.1g} ms", "late" if delay > 0 else "early"
-    return [f"the force comes {by} {when}, beyond what a spring, a damper and a mass explain. A filter in one of the "
-            "channels does that; so can a muscle of two parts in series, by a little. If your devices state a delay, "
-            "correct for it (--delay, in s; Python: delay=). Left in, it makes damping and stiffness wrong"]  # fmt: skip
+    return [
+        f"the force comes {by} {when}, beyond what a spring, a damper and a mass explain. A filter"
+        " in one of the channels does that; so can a muscle of two parts in series, by a little."
+        " If your devices state a delay, correct for it (--delay, in s; Python: delay=). Left in,"
+        " it makes damping and stiffness wrong"
+    ]
 
 
 def lengthens(response: Response) -> float:
-    """By how much chi² is lower if the displacement counts lengthening as positive; below 0: if it counts shortening.
+    """By how much chi² is lower if the displacement counts lengthening as positive; below 0: if it
+    counts shortening.
 
-    A spring, a damper and a mass, none of them negative, are fitted to H and to -H. Over the chi² of the better one for each
-    number, where that is more than 1.
+    A spring, a damper and a mass, none of them negative, are fitted to H and to -H. Over the chi²
+    of the better one for each number, where that is more than 1.
     """
-    shapes, values = _terms(response)[1], parts(response.value) / np.concatenate([response.stderr] * 2)
+    shapes, values = (
+        _terms(response)[1],
+        parts(response.value) / np.concatenate([response.stderr] * 2),
+    )
     as_it_is, turned = (scipy.optimize.nnls(shapes, sign * values)[1] ** 2 for sign in (1, -1))
     return float((turned - as_it_is) / max(1.0, min(turned, as_it_is) / values.size))
 

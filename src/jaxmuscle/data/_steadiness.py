@@ -34,7 +34,9 @@ ALL = "all"
 PARTS, SLOWEST = 4, 4  # parts of a recording; ordinates that say how sure its mean is
 ALIKE = 1.2  # longest trial over shortest
 TREMOR, RISE, HALF = 6.0, 4.0, 3  # Hz; standard deviations of a bin; bins on either side
-RANGES = {name.removeprefix("band"): edges for name, edges in BANDS.items()} | {"_above_12": (12.0, math.inf)}
+RANGES = {name.removeprefix("band"): edges for name, edges in BANDS.items()} | {
+    "_above_12": (12.0, math.inf)
+}
 FAST = 0.5  # Hz
 CUT_OFF = RECORDED.filter_cutoff or math.inf  # Hz, of the low-pass before everything
 SIGNED = ("mean", "dfa_exponent")  # all else is 0 or more
@@ -51,15 +53,19 @@ WORDS = {
     "dfa_exponent": "DFA exponent",
     "peak_frequency": "peak between 6 and 12 Hz",
 }
-PEAK = ("A peak, the sign of a tremor, is stated if the mean spectrum rises clearly above its scatter there. Of recordings "
-        "without a tremor at most 4 % show one.")  # fmt: skip
+PEAK = (
+    "A peak, the sign of a tremor, is stated if the mean spectrum rises clearly above its scatter"
+    " there. Of recordings without a tremor at most 4 % show one."
+)
 
 
 class Steadiness(Printed, Result, eqx.Module):
-    """What `steadiness` found; `print` shows it as a table, `found["sample_entropy"]` is one `Measure`.
+    """What `steadiness` found; `print` shows it as a table, `found["sample_entropy"]` is one
+    `Measure`.
 
-    `measures` of all trials together, by name; `trials`, the measures of each by its name, and their `durations` [s];
-    the `unit` and `quantity` of the signal; `notices`, sentences on what was done and what to mind.
+    `measures` of all trials together, by name; `trials`, the measures of each by its name, and
+    their `durations` [s]; the `unit` and `quantity` of the signal; `notices`, sentences on what was
+    done and what to mind.
     """
 
     measures: dict[str, Measure]
@@ -75,9 +81,18 @@ class Steadiness(Printed, Result, eqx.Module):
 
     def to_dict(self) -> dict[str, Any]:
         """The same for JSON, with `None` for what does not exist."""
-        each = {name: {"duration_s": self.durations[name], "measures": _plain(own)} for name, own in self.trials.items()}
-        return {"unit": self.unit, "quantity": self.quantity, "measures": _plain(self.measures), "trials": each,
-                "notices": list(self.notices), "versions": versions()}  # fmt: skip
+        each = {
+            name: {"duration_s": self.durations[name], "measures": _plain(own)}
+            for name, own in self.trials.items()
+        }
+        return {
+            "unit": self.unit,
+            "quantity": self.quantity,
+            "measures": _plain(self.measures),
+            "trials": each,
+            "notices": list(self.notices),
+            "versions": versions(),
+        }
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write `to_dict()` as JSON."""
@@ -86,41 +101,65 @@ class Steadiness(Printed, Result, eqx.Module):
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row per trial and quantity, then those of all trials together, whose `trial` is "all".
 
-        Columns `trial`, `duration_s`, `quantity`, `value`, `stderr`, `low` and `high` (ends of the 95 % interval), `unit`,
-        `error_from`.
+        Columns `trial`, `duration_s`, `quantity`, `value`, `stderr`, `low` and `high` (ends of the
+        95 % interval), `unit`, `error_from`.
         """
         lasted = self.durations | {ALL: sum(self.durations.values())}
-        rows = [{"trial": name, "duration_s": lasted[name], "quantity": quantity, **m.row()}
-                for name, own in (self.trials | {ALL: self.measures}).items() for quantity, m in own.items()]  # fmt: skip
+        rows = [
+            {"trial": name, "duration_s": lasted[name], "quantity": quantity, **m.row()}
+            for name, own in (self.trials | {ALL: self.measures}).items()
+            for quantity, m in own.items()
+        ]
         return frame(rows)
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
-        """Draw power by band, coefficients of variation and regularity, every trial as a dot; returns the figure."""
+        """Draw power by band, coefficients of variation and regularity, every trial as a dot;
+        returns the figure."""
         return plot.steadiness(self, ax)
 
     def __str__(self) -> str:
         count, seconds = len(self.trials), sorted(self.durations.values())
-        long = f"{seconds[0]:.3g} s" + (f" to {seconds[-1]:.3g} s each" if seconds[-1] > 1.01 * seconds[0] else "")
+        long = f"{seconds[0]:.3g} s" + (
+            f" to {seconds[-1]:.3g} s each" if seconds[-1] > 1.01 * seconds[0] else ""
+        )
         what = f"{count} trials" if count > 1 else next(iter(self.trials))
         lines = [_line(words, name, self.measures[name]) for name, words in WORDS.items()]
-        bands = [[_line(f"  {_range(*edges)}", f"{kind}{name}", self.measures[f"{kind}{name}"])
-                  for name, edges in RANGES.items()] for kind in ("power", "share")]  # fmt: skip
+        bands = [
+            [
+                _line(f"  {_range(*edges)}", f"{kind}{name}", self.measures[f"{kind}{name}"])
+                for name, edges in RANGES.items()
+            ]
+            for kind in ("power", "share")
+        ]
         square = squared(self.unit).replace("^2", "²")
         lines[5:5] = [f"power by band [{square}]", *bands[0], "share of the variance", *bands[1]]
         head = f"Steadiness of {what}: {self.quantity or 'signal'} [{self.unit}], {long}"
         columns = f"{'':<28}{'value ± standard error':<25} 95 % interval"
-        return folded([head, columns, *lines, _of_errors(count), PEAK, *(f"notice: {notice}" for notice in self.notices)])
+        return folded(
+            [
+                head,
+                columns,
+                *lines,
+                _of_errors(count),
+                PEAK,
+                *(f"notice: {notice}" for notice in self.notices),
+            ]
+        )
 
 
 def _of_errors(count: int) -> str:
     """What the errors contain."""
     if count < ENOUGH:
-        return (f"± is the standard error. It is estimated within {'the' if count == 1 else 'each'} recording: for "
-                "entropies and DFA from its four parts, for the peak from its Welch segments, for all else from its "
-                "spectrum.")  # fmt: skip
-    return (f"± is the standard error, from the scatter between the {count} trials. A fit states larger errors of mean "
-            "and variation: it takes at least the scatter by chance within the trials, and stretches the error of few "
-            "trials so that ± 1.96 of it is a 95 % interval.")  # fmt: skip
+        return (
+            f"± is the standard error. It is estimated within {'the' if count == 1 else 'each'}"
+            " recording: for entropies and DFA from its four parts, for the peak from its Welch"
+            " segments, for all else from its spectrum."
+        )
+    return (
+        f"± is the standard error, from the scatter between the {count} trials. A fit states larger"
+        " errors of mean and variation: it takes at least the scatter by chance within the trials,"
+        " and stretches the error of few trials so that ± 1.96 of it is a 95 % interval."
+    )
 
 
 def _plain(measures: dict[str, Measure]) -> dict[str, Any]:
@@ -135,7 +174,9 @@ def _line(words: str, name: str, m: Measure) -> str:
     """The ends of the interval have as many places as value and error."""
     percent = name.startswith((VARIATION, "share"))
     bare = m.unit == "1" or name.startswith("power")
-    scale, unit = (100.0, " %") if percent else (1.0, "" if bare else f" {m.unit.replace('^2', '²')}")
+    scale, unit = (
+        (100.0, " %") if percent else (1.0, "" if bare else f" {m.unit.replace('^2', '²')}")
+    )
     said, ends = f"{scale * m.value:.3g}{unit}", ""
     if math.isnan(m.value):
         said = "no sharp one" if name == "peak_frequency" else "none"
@@ -146,12 +187,13 @@ def _line(words: str, name: str, m: Measure) -> str:
 
 
 def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
-    """How steady a force, torque or displacement is held: variability, power by band, regularity. No model is fitted.
+    """How steady a force, torque or displacement is held: variability, power by band, regularity.
+    No model is fitted.
 
         print(jm.steadiness(jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()))
 
-    Everything is computed of the window of each recording (`steady()` finds it), as `Recording.filtered` gives it:
-    resampled to 100 Hz and low-passed at 30 Hz.
+    Everything is computed of the window of each recording (`steady()` finds it), as
+    `Recording.filtered` gives it: resampled to 100 Hz and low-passed at 30 Hz.
 
     | name | what it is |
     |---|---|
@@ -165,62 +207,88 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     | `dfa_exponent` | slope of detrended fluctuations, windows from 0.04 s to a tenth of the recording, order 1 |
     | `peak_frequency` | of the highest hill from 6 to 12 Hz [Hz]; NaN if there is none |
 
-    **Power by band** is the sum of `jaxmuscle.spectra.variance_spectrum` over low ≤ f < high. It takes the whole window, of
-    length T, at once, resolves 1/(2T), and loses nothing: the seven powers add up to σ². A drift is in the lowest band. The
-    shares of a fit (`band_0_0.5`) are of the 30 bins from 0.39 to 11.72 Hz only, and so are larger above 0.5 Hz.
+    **Power by band** is the sum of `jaxmuscle.spectra.variance_spectrum` over low ≤ f < high. It
+    takes the whole window, of length T, at once, resolves 1/(2T), and loses nothing: the seven
+    powers add up to σ². A drift is in the lowest band. The shares of a fit (`band_0_0.5`) are of
+    the 30 bins from 0.39 to 11.72 Hz only, and so are larger above 0.5 Hz.
 
-    **The peak** is a local maximum of the Welch spectrum (2.56 s, bins of 0.39 Hz), the vertex of the parabola through the
-    log power of its seven nearest bins. It counts if its log power stands 4/√segments above the higher of the valleys beside
-    it. Of simulated recordings without a peak, up to 4 % then show one. The peak of several trials is that of their mean
-    spectrum.
+    **The peak** is a local maximum of the Welch spectrum (2.56 s, bins of 0.39 Hz), the vertex of
+    the parabola through the log power of its seven nearest bins. It counts if its log power stands
+    4/√segments above the higher of the valleys beside it. Of simulated recordings without a peak,
+    up to 4 % then show one. The peak of several trials is that of their mean spectrum.
 
     **Several trials** count alike: any other value is the mean of the trials' values.
 
     **Standard errors**, by the number of trials:
 
-    - Three or more, "trials": the standard deviation between the trials over √n; of the peak, the jackknife over trials. A
-      fit takes the larger of this scatter and of what trials of this length scatter by chance: five may happen to agree.
-    - One or two, "spectrum": the ordinates of the spectrum are taken as independent, the variance of each as 2/3 of its
-      square, as in a stationary Gaussian signal; of the mean, from the four slowest. What is slower than the recording is
-      not in it: where the level wanders, the mean of the next trial differs by more.
-    - One or two, "parts" (entropies, DFA exponent): the standard deviation of the values of the four quarters over 2;
-      "segments" (peak): the jackknife over Welch segments.
+    - Three or more, "trials": the standard deviation between the trials over √n; of the peak, the
+      jackknife over trials. A fit takes the larger of this scatter and of what trials of this
+      length scatter by chance: five may happen to agree.
+    - One or two, "spectrum": the ordinates of the spectrum are taken as independent, the variance
+      of each as 2/3 of its square, as in a stationary Gaussian signal; of the mean, from the four
+      slowest. What is slower than the recording is not in it: where the level wanders, the mean of
+      the next trial differs by more.
+    - One or two, "parts" (entropies, DFA exponent): the standard deviation of the values of the
+      four quarters over 2; "segments" (peak): the jackknife over Welch segments.
 
-    **95 % intervals**, value ± t errors, with Student's t of ν degrees of freedom, cut where no value can lie (below 0; of a
-    share above 1): "trials" ν = n - 1; "parts" 3n; "segments" their number less 1; the mean 4n. For if the spectrum is flat
-    up to 2/T, the squared error of the mean is the mean of 4n squares of normal numbers, which are independent of the mean.
-    What else is from the "spectrum": value · exp(± 1.96 error / value); of a share p the same of its odds p / (1 - p). How
-    often they hold the expected value stands in `docs/recordings.md`.
+    **95 % intervals**, value ± t errors, with Student's t of ν degrees of freedom, cut where no
+    value can lie (below 0; of a share above 1): "trials" ν = n - 1; "parts" 3n; "segments" their
+    number less 1; the mean 4n. For if the spectrum is flat up to 2/T, the squared error of the mean
+    is the mean of 4n squares of normal numbers, which are independent of the mean. What else is
+    from the "spectrum": value · exp(± 1.96 error / value); of a share p the same of its odds p /
+    (1 - p). How often they hold the expected value stands in `docs/recordings.md`.
 
     **Arguments:** `recordings`, one or several trials of one condition of one person, in one unit.
 
     **Returns:** a `Steadiness`; it prints, plots and saves itself.
 
-    **Raises:** `ValueError` for no recordings, different units, a window that is constant or shorter than 3.84 s.
-    """
+    **Raises:** `ValueError` for no recordings, different units, a window that is constant or
+    shorter than 3.84 s.
+    """  # noqa: E501 (a row of a table is one line)
     each = [recordings] if isinstance(recordings, Recording) else list(recordings)
     require(len(each) > 0, "recordings", each, "give at least one Recording")
     for recording in each:
-        require(isinstance(recording, Recording), "recordings", recording, "load_recording(...) reads a file")
+        require(
+            isinstance(recording, Recording),
+            "recordings",
+            recording,
+            "load_recording(...) reads a file",
+        )
         recording._require_change()
         remedy = f"{recording.name} lasts {recording.duration:.3g} s; give at least {SHORTEST:g} s"
         require(recording.segments() >= SEGMENTS, "window", recording.window, remedy)
     _same_unit(each)
     names = [recording.name for recording in each]
-    names = [name if [*names, ALL].count(name) == 1 else f"{name} {i}" for i, name in enumerate(names, start=1)]
+    names = [
+        name if [*names, ALL].count(name) == 1 else f"{name} {i}"
+        for i, name in enumerate(names, start=1)
+    ]
     durations = {name: recording.duration for name, recording in zip(names, each, strict=True)}
     signals = [recording.filtered() for recording in each]
     segments = [_segments(x) for x in signals]
     own = [_own(x, each[0].unit) for x in signals]
-    trials = {name: _stated(m | {"peak_frequency": _peak([*s[:, None]], "segments")}, 1, len(s))
-              for name, m, s in zip(names, own, segments, strict=True)}  # fmt: skip
+    trials = {
+        name: _stated(m | {"peak_frequency": _peak([*s[:, None]], "segments")}, 1, len(s))
+        for name, m, s in zip(names, own, segments, strict=True)
+    }
     many = len(each) >= ENOUGH
-    peak = _peak(segments if many else [*np.concatenate(segments)[:, None]], "trials" if many else "segments")
-    together = {name: _together([m[name] for m in own]) for name in own[0]} | {"peak_frequency": peak}
+    peak = _peak(
+        segments if many else [*np.concatenate(segments)[:, None]], "trials" if many else "segments"
+    )
+    together = {name: _together([m[name] for m in own]) for name in own[0]} | {
+        "peak_frequency": peak
+    }
     together = _stated(together, len(each), sum(map(len, segments)))
     said = notices_of(each, signals, float(RECORDED.rate), [()] * len(each), each[0].quantity)
-    if len(each) < ENOUGH and each[0].quantity in ("force", "torque") and unlike(names, signals, each[0].unit):
-        said = (*said, "the errors do not contain how much two trials differ: for that give three or more")
+    if (
+        len(each) < ENOUGH
+        and each[0].quantity in ("force", "torque")
+        and unlike(names, signals, each[0].unit)
+    ):
+        said = (
+            *said,
+            "the errors do not contain how much two trials differ: for that give three or more",
+        )
     notices = (*said, *_mind(durations, together, own))
     return Steadiness(together, trials, durations, each[0].unit, each[0].quantity, notices)
 
@@ -228,22 +296,39 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
 def _same_unit(each: list[Recording]) -> None:
     units = {recording.unit: recording.name for recording in reversed(each)}
     told = ", ".join(f"{name} in {unit}" for unit, name in units.items())
-    remedy = "convert them to one unit (Recording(1e-3 * samples, rate, unit=...)), or report on each unit by itself"
+    remedy = (
+        "convert them to one unit (Recording(1e-3 * samples, rate, unit=...)), or report on each"
+        " unit by itself"
+    )
     if len(units) > 1:
         raise ValueError(f"recordings: units differ ({told}); {remedy}")
 
 
-def _mind(durations: dict[str, float], together: dict[str, Measure], own: list[dict[str, Measure]]) -> Iterable[str]:
+def _mind(
+    durations: dict[str, float], together: dict[str, Measure], own: list[dict[str, Measure]]
+) -> Iterable[str]:
     short, long = min(durations.values()), max(durations.values())
     if long > ALIKE * short:
-        yield (f"the trials last {short:.3g} s to {long:.3g} s: what is slow (variation, power below 0.5 Hz, DFA exponent) "
-               "grows with the length, so choose windows of one length")  # fmt: skip
+        yield (
+            f"the trials last {short:.3g} s to {long:.3g} s: what is slow (variation, power below"
+            " 0.5 Hz, DFA exponent) grows with the length, so choose windows of one length"
+        )
     if math.isnan(together[VARIATION].value):
         yield "the mean is near zero: there is no coefficient of variation"
-    likelier = {name: likelier_error([m[f"power{name}"] for m in own]) for name in RANGES} if len(own) >= ENOUGH else {}
-    if told := [f"± {error:.2g} from {_range(*RANGES[name])}" for name, error in likelier.items() if error is not None]:
-        yield ("in some bands the trials happen to agree much better than recordings of this length do: "
-               f"{', '.join(told)} is a more likely error of the power than the one in the table")  # fmt: skip
+    likelier = (
+        {name: likelier_error([m[f"power{name}"] for m in own]) for name in RANGES}
+        if len(own) >= ENOUGH
+        else {}
+    )
+    if told := [
+        f"± {error:.2g} from {_range(*RANGES[name])}"
+        for name, error in likelier.items()
+        if error is not None
+    ]:
+        yield (
+            "in some bands the trials happen to agree much better than recordings of this length"
+            f" do: {', '.join(told)} is a more likely error of the power than the one in the table"
+        )
 
 
 def _own(x: Float[np.ndarray, " times"], unit: str) -> dict[str, Measure]:
@@ -255,7 +340,9 @@ def _own(x: Float[np.ndarray, " times"], unit: str) -> dict[str, Measure]:
     sure = float(np.sqrt(np.mean(power[:SLOWEST])))
     found = {
         "mean": _measure(mean, sure, unit),
-        "standard_deviation": _measure(math.sqrt(variance), _error(power) / (2 * math.sqrt(variance)), unit),
+        "standard_deviation": _measure(
+            math.sqrt(variance), _error(power) / (2 * math.sqrt(variance)), unit
+        ),
         VARIATION: _variation(power, mean, sure),
         f"{VARIATION}_without_drift": _variation(level, mean, sure),
         f"{VARIATION}_above_{FAST:g}": _variation(power[f >= FAST], mean, sure),
@@ -269,7 +356,11 @@ def _own(x: Float[np.ndarray, " times"], unit: str) -> dict[str, Measure]:
     regular = {}
     whole, *parts = [(*regularity(part), dfa(part)) for part in (x, *np.array_split(x, PARTS))]
     for name, value, each in zip(REGULARITY, whole, zip(*parts, strict=True), strict=True):
-        error = float(np.std(each, ddof=1)) / math.sqrt(PARTS) if np.all(np.isfinite(each)) else math.nan
+        error = (
+            float(np.std(each, ddof=1)) / math.sqrt(PARTS)
+            if np.all(np.isfinite(each))
+            else math.nan
+        )
         regular[name] = _measure(value, error, "1", "parts")
     return found | shares | regular
 
@@ -280,7 +371,8 @@ def _measure(value: float, error: float, unit: str, error_from: str = "spectrum"
 
 
 def _error(power: Float[np.ndarray, " frequencies"]) -> float:
-    """Standard error of a sum: an ordinate is s χ²(1), its variance 2 s², and the mean of its square 3 s²."""
+    """Standard error of a sum: an ordinate is s χ²(1), its variance 2 s², and the mean of its
+    square 3 s²."""
     return math.sqrt(2 / 3 * float(np.sum(power**2)))
 
 
@@ -294,13 +386,23 @@ def _variation(power: Float[np.ndarray, " frequencies"], mean: float, sure: floa
 
 def _stated(measures: dict[str, Measure], trials: int, segments: int) -> dict[str, Measure]:
     """The measures with their 95 % intervals."""
-    degrees = {"trials": trials - 1, "spectrum": SLOWEST * trials, "parts": (PARTS - 1) * trials, "segments": segments - 1}
-    return {name: Measure(m.value, m.stderr, m.unit, m.error_from, _interval(name, m, degrees[m.error_from]))
-            for name, m in measures.items()}  # fmt: skip
+    degrees = {
+        "trials": trials - 1,
+        "spectrum": SLOWEST * trials,
+        "parts": (PARTS - 1) * trials,
+        "segments": segments - 1,
+    }
+    return {
+        name: Measure(
+            m.value, m.stderr, m.unit, m.error_from, _interval(name, m, degrees[m.error_from])
+        )
+        for name, m in measures.items()
+    }
 
 
 def _interval(name: str, m: Measure, degrees: int) -> tuple[float, float] | None:
-    """Student's t, cut where no value can lie; but of what the spectrum says besides the mean in the logarithm or logit."""
+    """Student's t, cut where no value can lie; but of what the spectrum says besides the mean in
+    the logarithm or logit."""
     if m.stderr is None:
         return None
     share = name.startswith("share")
@@ -311,7 +413,8 @@ def _interval(name: str, m: Measure, degrees: int) -> tuple[float, float] | None
 
 
 def _together(each: list[Measure]) -> Measure:
-    """The mean over the trials; its error from their scatter, or of few trials from their own errors."""
+    """The mean over the trials; its error from their scatter, or of few trials from their own
+    errors."""
     values, first, count = [m.value for m in each], each[0], len(each)
     if not np.all(np.isfinite(values)):
         return _measure(math.nan, math.nan, first.unit, first.error_from)
@@ -325,19 +428,26 @@ def _together(each: list[Measure]) -> Measure:
 def _segments(x: Float[np.ndarray, " times"]) -> Float[np.ndarray, "segments bins"]:
     """The spectrum of every Welch segment."""
     length, bins = RECORDED.length, slice(RECORDED.first_bin, RECORDED.last_bin + 1)
-    return scipy.signal.spectrogram(x, RECORDED.rate, "hann", length, length - RECORDED.step)[2].T[:, bins]
+    return scipy.signal.spectrogram(x, RECORDED.rate, "hann", length, length - RECORDED.step)[2].T[
+        :, bins
+    ]
 
 
 def _peak(groups: list[np.ndarray], error_from: str) -> Measure:
-    """The hill of the mean of all segments; its error by leaving out one group of them after another."""
+    """The hill of the mean of all segments; its error by leaving out one group of them after
+    another."""
     whole, count = np.concatenate(groups), len(groups)
     value = _hill(np.mean(whole, axis=0), RISE / math.sqrt(len(whole)))
-    left_out = [_hill(np.mean(np.concatenate(groups[:i] + groups[i + 1 :]), axis=0), 0.0) for i in range(count)]
+    left_out = [
+        _hill(np.mean(np.concatenate(groups[:i] + groups[i + 1 :]), axis=0), 0.0)
+        for i in range(count)
+    ]
     return _measure(value, math.sqrt((count - 1) * float(np.var(left_out))), "Hz", error_from)
 
 
 def _hill(power: Float[np.ndarray, " bins"], rise: float) -> float:
-    """Frequency of the most prominent maximum of log power above 6 Hz; NaN if none rises so much."""
+    """Frequency of the most prominent maximum of log power above 6 Hz; NaN if none rises so
+    much."""
     f, logged = RECORDED.frequency, np.log(power)
     tops, seen = scipy.signal.find_peaks(logged, prominence=rise)
     fast = f[tops] >= TREMOR

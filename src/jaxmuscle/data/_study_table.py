@@ -1,4 +1,5 @@
-"""The table of a study: which file is which trial of whom, in which group and condition, and how files are read."""
+"""The table of a study: which file is which trial of whom, in which group and condition, and how
+files are read."""
 
 import os
 from collections import defaultdict
@@ -24,7 +25,8 @@ from ._trials import Trials
 NEEDED = ("file", "person")
 TABLES = "the table of a study (.csv, .tsv, .txt or .toml)"
 LABELS = (*NEEDED, "group", "condition", "trial")
-FILES, SPECTRA = (*Reading._fields, "skip_rows"), ("spectrum", "mvc")  # of `load_recording`, of `Trials.target`
+# of `load_recording`, of `Trials.target`
+FILES, SPECTRA = (*Reading._fields, "skip_rows"), ("spectrum", "mvc")
 EDGES = ("window_start", "window_stop")
 STEADY = "`window` of the study.toml, else its steady part; an error beside the other edge"
 NUMBERS = ("rate", "max_gap", "lever_arm", "skip_rows", "mvc", *EDGES)
@@ -41,36 +43,68 @@ class ReadingTable(Table, kw_only=True):
 
     column: Annotated[
         str | int | None,
-        says("Column of the force: its name, or its number from 0. Or NAME of a [point](../recordings.md#what-is-read), "
-             "if its coordinates are the columns NAME_x, NAME_y, NAME_z",
-             missing="the only one besides the time, or the only force or torque by its name or unit; else an error"),
-    ] = None  # fmt: skip
-    rate: Annotated[Above0 | None, says("Sampling rate [Hz]", missing="as the file says; an error if it does not")] = None
-    units: Annotated[str | None, says("Unit of the column", missing="as the file says, else N; of a point an error")] = None
+        says(
+            "Column of the force: its name, or its number from 0. Or NAME of a"
+            " [point](../recordings.md#what-is-read), if its coordinates are the columns NAME_x,"
+            " NAME_y, NAME_z",
+            missing=(
+                "the only one besides the time, or the only force or torque by its name or unit;"
+                " else an error"
+            ),
+        ),
+    ] = None
+    rate: Annotated[
+        Above0 | None,
+        says("Sampling rate [Hz]", missing="as the file says; an error if it does not"),
+    ] = None
+    units: Annotated[
+        str | None,
+        says("Unit of the column", missing="as the file says, else N; of a point an error"),
+    ] = None
     axis: Annotated[
         str | None,
-        says("Of a point: x, y, z, or principal, along which it moves most", missing="the column is not a point"),
+        says(
+            "Of a point: x, y, z, or principal, along which it moves most",
+            missing="the column is not a point",
+        ),
     ] = None
     reference: Annotated[
-        str | int | None, says("Column or point that is subtracted from it", missing="nothing is subtracted")
+        str | int | None,
+        says("Column or point that is subtracted from it", missing="nothing is subtracted"),
     ] = None
     time: Annotated[
         str | int | None,
-        says("Column of the time", missing="found by its name or unit; or a first column that rises evenly"),
+        says(
+            "Column of the time",
+            missing="found by its name or unit; or a first column that rises evenly",
+        ),
     ] = None
-    max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, says("Longest gap that is closed [s]", missing="0.2")] = None
+    max_gap: Annotated[
+        Annotated[float, Meta(ge=0)] | None, says("Longest gap that is closed [s]", missing="0.2")
+    ] = None
     lever_arm: Annotated[
         Above0 | None,
-        says("From the axis to where the force acts [m]: turns a torque into N", missing="a torque stays a torque"),
+        says(
+            "From the axis to where the force acts [m]: turns a torque into N",
+            missing="a torque stays a torque",
+        ),
     ] = None
-    skip_rows: Annotated[Annotated[int, Meta(ge=0)] | None, says("Lines to leave out at the top", missing="0")] = None
+    skip_rows: Annotated[
+        Annotated[int, Meta(ge=0)] | None, says("Lines to leave out at the top", missing="0")
+    ] = None
     spectrum: Annotated[
         str | None,
-        says("standard, slow (resolves what is below 1 Hz), multitaper or pwelch; the same for all", missing="standard"),
+        says(
+            "standard, slow (resolves what is below 1 Hz), multitaper or pwelch; the same for all",
+            missing="standard",
+        ),
     ] = None
     mvc: Annotated[
         Above0 | None,
-        says("Maximal voluntary contraction, in the recording's unit", missing="level unknown, if the unit is not % MVC"),
+        says(
+            "Maximal voluntary contraction, in the recording's unit",
+            missing="level unknown, if the unit is not % MVC",
+        ),
     ] = None
 
 
@@ -78,20 +112,31 @@ class RecordingTable(ReadingTable, kw_only=True):
     """Which recording: a row of a study.csv, or an entry of `[[recordings]]`."""
 
     file: Annotated[
-        str, says("Path, from the folder of the study.csv, or of the study.toml where the recordings stand in it")
+        str,
+        says(
+            "Path, from the folder of the study.csv, or of the study.toml where the recordings"
+            " stand in it"
+        ),
     ]
     person: Annotated[str | int, says("Name of the person")]
     group: Annotated[
-        str | int | None, says("Group of the person; all recordings have one, or none", missing="no groups")
+        str | int | None,
+        says("Group of the person; all recordings have one, or none", missing="no groups"),
     ] = None
     condition: Annotated[
-        str | int | None, says("Condition of the recording; all have one, or none", missing="no conditions")
+        str | int | None,
+        says("Condition of the recording; all have one, or none", missing="no conditions"),
     ] = None
     trial: Annotated[
         str | int | None,
-        says("Which of several trials in a condition", missing="no name; a person may have several trials without one"),
+        says(
+            "Which of several trials in a condition",
+            missing="no name; a person may have several trials without one",
+        ),
     ] = None
-    window_start: Annotated[float | None, says("Where the part to analyse begins [s]", missing=STEADY)] = None
+    window_start: Annotated[
+        float | None, says("Where the part to analyse begins [s]", missing=STEADY)
+    ] = None
     window_stop: Annotated[float | None, says("Where it ends [s]", missing=STEADY)] = None
 
 
@@ -99,27 +144,49 @@ class StudyFile(ReadingTable, kw_only=True):
     """What else a study.toml may say."""
 
     table: Annotated[
-        str | None, says("Path of a study.csv, from the folder of the study.toml", missing="needs `recordings`")
+        str | None,
+        says(
+            "Path of a study.csv, from the folder of the study.toml", missing="needs `recordings`"
+        ),
     ] = None
-    recordings: Annotated[list[RecordingTable] | None, says("The recordings themselves", missing="needs a `table`")] = None
+    recordings: Annotated[
+        list[RecordingTable] | None, says("The recordings themselves", missing="needs a `table`")
+    ] = None
     window: Annotated[
         tuple[float, float] | Literal["all"] | None,
-        says("Part to analyse: begin and end [s]; or 'all' in place of both", missing="the steady parts are looked for"),
+        says(
+            "Part to analyse: begin and end [s]; or 'all' in place of both",
+            missing="the steady parts are looked for",
+        ),
     ] = None
-    rung: Annotated[int | str | None, says("Model of all people: 0 to 3, or auto", missing="2")] = None
+    rung: Annotated[int | str | None, says("Model of all people: 0 to 3, or auto", missing="2")] = (
+        None
+    )
     noise: Annotated[
         str | None,
-        says("Colour of the noise: white, band-limited, ornstein-uhlenbeck or pink", missing="band-limited"),
+        says(
+            "Colour of the noise: white, band-limited, ornstein-uhlenbeck or pink",
+            missing="band-limited",
+        ),
     ] = None
     quantities: Annotated[
-        list[str] | None, says("Quantities that are compared", missing="all derived quantities but `high_frequency_floor`")
+        list[str] | None,
+        says(
+            "Quantities that are compared",
+            missing="all derived quantities but `high_frequency_floor`",
+        ),
     ] = None
-    alpha: Annotated[float | None, says("Level of the tests, between 0 and 1", missing="0.05")] = None
-    correction: Annotated[str | None, says("Correction for many comparisons: holm, fdr or none", missing="holm")] = None
+    alpha: Annotated[float | None, says("Level of the tests, between 0 and 1", missing="0.05")] = (
+        None
+    )
+    correction: Annotated[
+        str | None, says("Correction for many comparisons: holm, fdr or none", missing="holm")
+    ] = None
 
 
 class Row(NamedTuple):
-    """A recording of a study: `place`, what an error calls it; whose it is; `reading`, how the file is read."""
+    """A recording of a study: `place`, what an error calls it; whose it is; `reading`, how the file
+    is read."""
 
     place: str
     file: Path
@@ -150,7 +217,8 @@ class Cell(NamedTuple):
 
 
 def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") -> StudyTable:
-    """The table of a study from a .csv, .tsv or .txt, from a .toml that names one or has `[[recordings]]`, or from rows.
+    """The table of a study from a .csv, .tsv or .txt, from a .toml that names one or has
+    `[[recordings]]`, or from rows.
 
     **Raises:** `ValueError` naming file, line and column, and the remedy.
     """
@@ -164,19 +232,26 @@ def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") ->
     checked(stated, StudyFile, str(path))
     options = {name: value for name, value in stated.items() if name in OPTIONS}
     if ("table" in stated) == ("recordings" in stated):
-        raise ValueError(f'{path}: give either table = "study.csv" or [[recordings]], each with file and person')
+        raise ValueError(
+            f'{path}: give either table = "study.csv" or [[recordings]], each with file and person'
+        )
     if "table" in stated:
         table = path.parent / expanded(stated["table"])
         return StudyTable(_checked(_lines(table), table.parent, str(table)), options, path.name)
-    places = ((f"{path}: recording {number}", dict(row)) for number, row in enumerate(stated["recordings"], 1))
+    places = (
+        (f"{path}: recording {number}", dict(row))
+        for number, row in enumerate(stated["recordings"], 1)
+    )
     return StudyTable(_checked(places, path.parent, str(path)), options, path.name)
 
 
 def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cell]:
-    """The trials of every person in every condition made one target, each in its own or the `defaults`' window, or steady.
+    """The trials of every person in every condition made one target, each in its own or the
+    `defaults`' window, or steady.
 
-    **Raises:** `ValueError` naming the line of a file that cannot be read or has no steady part, of a spectrum that is not
-    that of the others, and of an mvc that is not that of the same person in the same condition.
+    **Raises:** `ValueError` naming the line of a file that cannot be read or has no steady part, of
+    a spectrum that is not that of the others, and of an mvc that is not that of the same person in
+    the same condition.
     """
     together: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
     stated: dict[Any, tuple[Row, Any]] = {}
@@ -186,9 +261,26 @@ def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cel
         whose = row.person, row.group, row.condition
         try:
             require(spectrum in (None, *NAMED), "spectrum", spectrum, choices(str(spectrum), NAMED))
-            require(mvc is None or isinstance(mvc, int | float), "mvc", mvc, "give a number in the unit of the recording")
-            _as_before(stated, "spectrum", row, spectrum or "standard", "give all rows the same, to compare like with like")
-            _as_before(stated, whose, row, mvc, "give all trials of a person in a condition the same mvc, or none")
+            require(
+                mvc is None or isinstance(mvc, int | float),
+                "mvc",
+                mvc,
+                "give a number in the unit of the recording",
+            )
+            _as_before(
+                stated,
+                "spectrum",
+                row,
+                spectrum or "standard",
+                "give all rows the same, to compare like with like",
+            )
+            _as_before(
+                stated,
+                whose,
+                row,
+                mvc,
+                "give all trials of a person in a condition the same mvc, or none",
+            )
             recording = load_recording(row.file, **reading)
             together[whose].append(recording if window == "all" else recording.steady(window))
         except ValueError as error:
@@ -201,11 +293,17 @@ def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cel
             target = Trials(recordings).target(name, mvc=mvc, settings=stated["spectrum"][1])
         except ValueError as error:
             raise ValueError(f"{first.place}: {name}: {error}") from None
-        found.append(Cell(person, group, condition, len(recordings), tuple(r.rate for r in recordings), target))
+        found.append(
+            Cell(
+                person, group, condition, len(recordings), tuple(r.rate for r in recordings), target
+            )
+        )
     return found
 
 
-def _as_before(stated: dict[Any, tuple[Row, Any]], key: Any, row: Row, value: Any, remedy: str) -> None:
+def _as_before(
+    stated: dict[Any, tuple[Row, Any]], key: Any, row: Row, value: Any, remedy: str
+) -> None:
     """Remember what the first row says; refuse a row that says something else."""
     first, before = stated.setdefault(key, (row, value))
     if before != value:
@@ -221,13 +319,17 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
     names = [name.casefold() for name in cells_of(head.body, delimiter)]
     for name in names:
         if name not in COLUMNS:
-            raise ValueError(f"{path}: {head.place}: unknown column {name!r}; {choices(name, COLUMNS)}")
+            raise ValueError(
+                f"{path}: {head.place}: unknown column {name!r}; {choices(name, COLUMNS)}"
+            )
         if names.count(name) > 1:
             raise ValueError(f"{path}: {head.place}: two columns are called {name}: leave one out")
     for name in NEEDED:
         if name not in names:
-            raise ValueError(f"{path}: {head.place}: no column {name}; the header needs file and person, and may have "
-                             f"{', '.join(COLUMNS[2:])}")  # fmt: skip
+            raise ValueError(
+                f"{path}: {head.place}: no column {name}; the header needs file and person, and may"
+                f" have {', '.join(COLUMNS[2:])}"
+            )
     found = []
     for line in body:
         cells, place = cells_of(line.body, delimiter), f"{path}: {line.place}"
@@ -236,7 +338,9 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
         row: dict[str, Any] = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
         for name in set(NUMBERS) & set(row):
             try:
-                row[name] = int(row[name]) if name == "skip_rows" else number_in(row[name], delimiter)
+                row[name] = (
+                    int(row[name]) if name == "skip_rows" else number_in(row[name], delimiter)
+                )
                 if not is_real(row[name]):
                     raise ValueError(f"{row[name]} is not finite")
             except ValueError:
@@ -246,7 +350,9 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
     return found
 
 
-def _checked(places: Iterable[tuple[str, dict[str, Any]]], folder: Path, source: str) -> tuple[Row, ...]:
+def _checked(
+    places: Iterable[tuple[str, dict[str, Any]]], folder: Path, source: str
+) -> tuple[Row, ...]:
     """The rows, and that together they are a study."""
     rows = tuple(_row(place, given, folder) for place, given in places)
     group: dict[str, Row] = {}
@@ -254,19 +360,29 @@ def _checked(places: Iterable[tuple[str, dict[str, Any]]], folder: Path, source:
     for row in rows:
         for label in ("group", "condition"):
             if not getattr(row, label) and any(getattr(other, label) for other in rows):
-                raise ValueError(f"{row.place}: has no {label}, others do; give every recording one, or none")
+                raise ValueError(
+                    f"{row.place}: has no {label}, others do; give every recording one, or none"
+                )
         first = group.setdefault(row.person, row)
         if first.group != row.group:
-            raise ValueError(f"{row.place}: {row.person} is in group {row.group} here and in group {first.group} at "
-                             f"{first.place}; a person has one group (what changes within people: a condition)")  # fmt: skip
+            raise ValueError(
+                f"{row.place}: {row.person} is in group {row.group} here and in group {first.group}"
+                f" at {first.place}; a person has one group (what changes within people: a"
+                " condition)"
+            )
         same = seen.setdefault((row.file, repr(row.reading)), row)
         if same is not row:
             raise ValueError(f"{row.place}: the same recording as at {same.place}: leave one out")
         twin = seen.setdefault((row.person, row.condition, row.trial), row) if row.trial else row
         if twin is not row:
-            raise ValueError(f"{row.place}: trial {row.trial} of {row.person} is there already, at {twin.place}")
+            raise ValueError(
+                f"{row.place}: trial {row.trial} of {row.person} is there already, at {twin.place}"
+            )
     if len(group) < 2:
-        raise ValueError(f"{source}: holds {len(group)} people; a study needs at least 2 (of one: jaxmuscle fit TRIALS)")
+        raise ValueError(
+            f"{source}: holds {len(group)} people; a study needs at least 2 (of one: jaxmuscle fit"
+            " TRIALS)"
+        )
     return rows
 
 

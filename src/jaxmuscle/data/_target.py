@@ -25,37 +25,41 @@ from ._target_files import KEYS, REQUIRED, fields_of, on_grid, read_target, sett
 
 # A sum this near to 1 is rounding of the printed numbers, not another scale.
 SUM_TOLERANCE = 1e-3
-# Of the mean, where nothing says how far it may be from the person's; and the least, that of a good calibration.
+# Of the mean, where nothing says how far it may be from the person's; and the least, that of a good
+# calibration.
 MEAN_ERROR, LEAST_MEAN_ERROR = 0.02, 0.002
 UNUSUAL = 1.25  # dispersion from which trials are said to differ
 
 
 class Target(Shown, eqx.Module):
-    """What a fit is given: a proportional power spectrum p_k = P_k / Σ_j P_j on the bins k that are covered, and its origin.
+    """What a fit is given: a proportional power spectrum p_k = P_k / Σ_j P_j on the bins k that are
+    covered, and its origin.
 
     **Arguments:**
 
     - `name`: how reports call it.
-    - `proportional_power`: p_k > 0, shape `(bins,)`; it is divided by its sum. The target's attribute `frequency` has the
-      frequency [Hz] of each.
+    - `proportional_power`: p_k > 0, shape `(bins,)`; it is divided by its sum. The target's
+      attribute `frequency` has the frequency [Hz] of each.
     - `bins`: bin numbers on the grid of `settings`, increasing; all selected bins by default.
     - `quantity`: what was recorded; torque is fitted as force, since p has no scale.
     - `provenance`, `source`: how and from where the numbers were obtained.
     - `reason`: what a reconstruction assumes.
     - `sigma`: standard deviation of p_k, scaled together with it.
     - `segments`: number K of Welch segments of each trial. They say how much the bins scatter.
-    - `coefficient_of_variation`: standard deviation over mean of each trial, a fraction. It is that of the force as the
-      spectrum sees it, low-passed as `settings` say. An acceleration has none, since its mean is zero.
+    - `coefficient_of_variation`: standard deviation over mean of each trial, a fraction. It is that
+      of the force as the spectrum sees it, low-passed as `settings` say. An acceleration has none,
+      since its mean is zero.
     - `mvc_fraction`: mean level as a fraction of the maximal voluntary contraction.
-    - `mean`, `unit`: mean force or torque of each trial, and its unit. A mean in a unit of force fixes its scale
-      in a fit.
-    - `trial_power`: spectrum of each trial [unit²/Hz], shape `(trials, bins)`; `proportional_power` is their mean, weighted
-      with `segments`.
-    - `dispersion`: how many times more the trials' average spectrum scatters than their segments explain, and the
-      standard error of this number. Above 1 it widens every error. If `trial_power` is given, it follows from that
-      (docs/recordings.md, *Several trials of one person*).
-    - `stiffness`: the dynamic stiffness measured beside it, by a perturbation. Then `proportional_power` may be `None`: the
-      target has no spectrum.
+    - `mean`, `unit`: mean force or torque of each trial, and its unit. A mean in a unit of force
+      fixes its scale in a fit.
+    - `trial_power`: spectrum of each trial [unit²/Hz], shape `(trials, bins)`; `proportional_power`
+      is their mean, weighted with `segments`.
+    - `dispersion`: how many times more the trials' average spectrum scatters than their segments
+      explain, and the standard error of this number. Above 1 it widens every error. If
+      `trial_power` is given, it follows from that (docs/recordings.md, *Several trials of one
+      person*).
+    - `stiffness`: the dynamic stiffness measured beside it, by a perturbation. Then
+      `proportional_power` may be `None`: the target has no spectrum.
     - `settings`: how the spectrum was estimated. The model's spectrum is made in the same way.
     - `notices`: what was done to the numbers, in sentences.
 
@@ -109,36 +113,50 @@ class Target(Shown, eqx.Module):
         self.quantity = check.metadata("quantity", quantity)
         self.provenance = check.metadata("provenance", provenance)
         self.segments = check.metadata("segments", segments)
-        self.coefficient_of_variation = check.metadata("coefficient_of_variation", coefficient_of_variation)
+        self.coefficient_of_variation = check.metadata(
+            "coefficient_of_variation", coefficient_of_variation
+        )
         if self.quantity == "acceleration" and coefficient_of_variation is not None:
-            raise TargetError("coefficient_of_variation: the mean of an acceleration is zero; leave it out")
+            raise TargetError(
+                "coefficient_of_variation: the mean of an acceleration is zero; leave it out"
+            )
         self.mvc_fraction = check.metadata("mvc_fraction", mvc_fraction)
         self.mean, self.unit = check.metadata("mean", mean), check.metadata("unit", unit)
         self.reason = check.metadata("reason", reason)
         self.settings = settings
-        self.stiffness = FrequencyResponse.from_table(stiffness) if isinstance(stiffness, Mapping) else stiffness
+        self.stiffness = (
+            FrequencyResponse.from_table(stiffness) if isinstance(stiffness, Mapping) else stiffness
+        )
         if self.stiffness is not None and not isinstance(self.stiffness, FrequencyResponse):
-            raise TargetError(f"stiffness: this is a {type(stiffness).__name__}; give a FrequencyResponse, or its table")
+            raise TargetError(
+                f"stiffness: this is a {type(stiffness).__name__}; give a FrequencyResponse, or its"
+                " table"
+            )
         if proportional_power is None and stiffness is not None:
             proportional_power, bins = np.zeros(0), np.zeros(0, int)
         selected = np.arange(settings.first_bin, settings.last_bin + 1)
         self.bins = check.frozen(selected if bins is None else check.bin_numbers(bins, settings))
         self.frequency = check.frozen(settings.frequency[self.bins - settings.first_bin])
         power = (
-            np.zeros(0) if self.bins.size == 0 else check.positive("proportional_power", proportional_power, self.bins.size)
+            np.zeros(0)
+            if self.bins.size == 0
+            else check.positive("proportional_power", proportional_power, self.bins.size)
         )
         deviation = None if sigma is None else check.positive("sigma", sigma, self.bins.size)
         self.proportional_power, self.sigma = _normalised(power, deviation)
         self.trial_power, self.dispersion = None, check.metadata("dispersion", dispersion)
         if trial_power is not None:
             self.trial_power = check.trial_powers(trial_power, self.bins.size, self.segments, power)
-            self.dispersion = dispersion_of(self.trial_power, self.segments or (), settings, self.bins)
+            self.dispersion = dispersion_of(
+                self.trial_power, self.segments or (), settings, self.bins
+            )
         own = _own_notices(self, float(np.sum(power)))
         self.notices = tuple(dict.fromkeys((*check.metadata("notices", list(notices)), *own)))
 
     @property
     def degrees_of_freedom(self) -> float | None:
-        """Equivalent degrees of freedom ν of a bin, the sum over the trials; `None` without `segments`.
+        """Equivalent degrees of freedom ν of a bin, the sum over the trials; `None` without
+        `segments`.
 
         Bin 1 has fewer (docs/fitting.md, *What is minimised*), which is not counted here.
         """
@@ -148,29 +166,39 @@ class Target(Shown, eqx.Module):
 
     @property
     def overdispersion(self) -> float:
-        """What multiplies the standard deviations of the log powers: the dispersion, if it is above 1."""
+        """What multiplies the standard deviations of the log powers: the dispersion, if it is above
+        1."""
         return 1.0 if self.dispersion is None else max(1.0, self.dispersion[0])
 
     @property
     def mean_force(self) -> tuple[float, float] | None:
         """Mean force and its standard error [N]; `None` without a mean in newtons.
 
-        The error: that of the trials' scatter or that of a recording of this length, whichever is larger. If it is the
-        former, with Student's t, so that ± 1.96 of it hold 95 % (of three trials or more). The latter is
-        `√(S₁ / 2T)`, S₁ the density in the lowest bin and T the time of all trials together, but at least 0.2 % of the
-        mean; or 2 % of the mean, if the target lacks a spectrum, segments or coefficient of variation.
+        The error: that of the trials' scatter or that of a recording of this length, whichever is
+        larger. If it is the former, with Student's t, so that ± 1.96 of it hold 95 % (of three
+        trials or more). The latter is `√(S₁ / 2T)`, S₁ the density in the lowest bin and T the time
+        of all trials together, but at least 0.2 % of the mean; or 2 % of the mean, if the target
+        lacks a spectrum, segments or coefficient of variation.
         """
         if self.mean is None or self.unit not in NEWTONS or self.quantity != "force":
             return None
         means = NEWTONS[self.unit] * np.asarray(self.mean)
         relative = MEAN_ERROR
-        if self.segments is not None and self.coefficient_of_variation is not None and self.bins.size:
+        if (
+            self.segments is not None
+            and self.coefficient_of_variation is not None
+            and self.bins.size
+        ):
             density = (
-                np.mean(np.square(self.coefficient_of_variation)) * self.proportional_power[0] / self.settings.resolution
+                np.mean(np.square(self.coefficient_of_variation))
+                * self.proportional_power[0]
+                / self.settings.resolution
             )
             time = len(self.segments) * trial_samples(self) / self.settings.rate
             relative = np.sqrt(density / (2 * time))
-        return float(means.mean()), float(mean_error(means, max(relative, LEAST_MEAN_ERROR) * means.mean()))
+        return float(means.mean()), float(
+            mean_error(means, max(relative, LEAST_MEAN_ERROR) * means.mean())
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write TOML that `load_target` reads back equal; an existing file is replaced in one step.
@@ -188,10 +216,11 @@ class Target(Shown, eqx.Module):
             raise TargetError(f"{path}: cannot be written: {error.strerror}") from None
 
     def sampling_band(self) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]] | None:
-        """Lower and upper edge of p_k exp(-bias ± sd), where the expected spectrum lies within one standard deviation.
+        """Lower and upper edge of p_k exp(-bias ± sd), where the expected spectrum lies within one
+        standard deviation.
 
-        `bias` and `sd` are mean offset and standard deviation of a bin's log power (docs/fitting.md, *What is minimised*).
-        `None` if nothing is known about the sampling error.
+        `bias` and `sd` are mean offset and standard deviation of a bin's log power
+        (docs/fitting.md, *What is minimised*). `None` if nothing is known about the sampling error.
         """
         statistics = bin_statistics(self)
         if not statistics.known:
@@ -200,23 +229,36 @@ class Target(Shown, eqx.Module):
         return centre * np.exp(-statistics.sd), centre * np.exp(statistics.sd)
 
     def to_table(self, *, whole: bool = False) -> dict[str, Any]:
-        """The target as the table that a TOML file holds; `whole`, with None for what it does not state, as in fit.json."""
+        """The target as the table that a TOML file holds; `whole`, with None for what it does not
+        state, as in fit.json."""
         sigma = None if self.sigma is None else self.sigma.tolist()
-        arrays = {"frequency_hz": self.frequency.tolist(), "settings": self.settings.to_dict(whole=whole)}
+        arrays = {
+            "frequency_hz": self.frequency.tolist(),
+            "settings": self.settings.to_dict(whole=whole),
+        }
         arrays |= {"proportional_power": self.proportional_power.tolist(), "sigma": sigma}
         arrays["trial_power"] = None if self.trial_power is None else self.trial_power.tolist()
         arrays["dispersion"] = self.dispersion if self.trial_power is None else None
         arrays["stiffness"] = None if self.stiffness is None else self.stiffness.to_table()
         table = {key: arrays[key] if key in arrays else getattr(self, key) for key in KEYS}
-        return table if whole else {key: value for key, value in table.items() if value not in (None, ())}
+        return (
+            table
+            if whole
+            else {key: value for key, value in table.items() if value not in (None, ())}
+        )
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], *, whole: bool = False) -> "Target":
-        """The reverse of `to_table`: each frequency counts as the nearest bin. Raises `TargetError`."""
+        """The reverse of `to_table`: each frequency counts as the nearest bin. Raises
+        `TargetError`."""
         fields = fields_of(table, "target_table", needed=KEYS if whole else (*REQUIRED, "settings"))
         fields = {key: value for key, value in fields.items() if value is not None}
-        settings = settings_of(fields.pop("settings"), "target_table.settings", SpectrumSettings.names(whole=whole))
-        frequency = numbers_of("frequency_hz", fields.pop("frequency_hz"), "target_table", empty="stiffness" in fields)
+        settings = settings_of(
+            fields.pop("settings"), "target_table.settings", SpectrumSettings.names(whole=whole)
+        )
+        frequency = numbers_of(
+            "frequency_hz", fields.pop("frequency_hz"), "target_table", empty="stiffness" in fields
+        )
         with np.errstate(over="ignore"):
             bins = np.rint(np.clip(frequency / settings.resolution, -1e9, 1e9)).astype(int)
         return cls(**fields, bins=bins, settings=settings)
@@ -226,7 +268,8 @@ class Target(Shown, eqx.Module):
         return Target.from_table(self.to_table() | {"stiffness": stiffness})
 
     def plot(self, ax: Any = None, *, log: bool = False) -> Any:
-        """Draw the spectrum, see `jaxmuscle.plot.target`; `log`: both axes logarithmic. Returns the axes."""
+        """Draw the spectrum, see `jaxmuscle.plot.target`; `log`: both axes logarithmic. Returns the
+        axes."""
         return plot.target(self, ax, log=log)
 
     def _card(self) -> Card:
@@ -234,14 +277,21 @@ class Target(Shown, eqx.Module):
         known = [("source", self.source)]
         if f.size:
             peak = int(np.argmax(p))
-            known += [("spectrum", settings.name or "settings of its own"),
-                      ("bins", f"{f.size} of {settings.frequency.size}, {f[0]:.3f} to {f[-1]:.3f} Hz"),
-                      ("maximum", f"{p[peak]:.3f} at {f[peak]:.3f} Hz")]  # fmt: skip
+            known += [
+                ("spectrum", settings.name or "settings of its own"),
+                ("bins", f"{f.size} of {settings.frequency.size}, {f[0]:.3f} to {f[-1]:.3f} Hz"),
+                ("maximum", f"{p[peak]:.3f} at {f[peak]:.3f} Hz"),
+            ]
         if self.stiffness is not None:
             at = self.stiffness.frequency
             known.append(("dynamic stiffness", f"{at.size} points, {at[0]:.3g} to {at[-1]:.3g} Hz"))
         if self.segments is not None:
-            known.append(("segments", f"{_words(self.segments)} ({self.degrees_of_freedom:.1f} degrees of freedom)"))
+            known.append(
+                (
+                    "segments",
+                    f"{_words(self.segments)} ({self.degrees_of_freedom:.1f} degrees of freedom)",
+                )
+            )
         if self.coefficient_of_variation is not None:
             variation = ", ".join(f"{100 * value:.3g} %" for value in self.coefficient_of_variation)
             known.append(("coefficient of variation", variation))
@@ -269,20 +319,23 @@ def load_target(
         target = jm.load_target("vastus-lateralis-26mvc")
         print(target)
 
-    A CSV has the columns `frequency_hz,proportional_power[,sigma]`, sorted and unique. A figure digitised with
-    WebPlotDigitizer is its project (.json, .tar), its CSV of all datasets, or two columns without a header; its
-    points are sorted and near-duplicates averaged (docs/digitise.md). Points off the grid are interpolated onto
-    the bins in log power, and in log frequency from a logarithmic axis; bins that are not covered are left out,
-    and power is rescaled to sum to 1 over the others. The target's `notices` say which of these happened.
+    A CSV has the columns `frequency_hz,proportional_power[,sigma]`, sorted and unique. A figure
+    digitised with WebPlotDigitizer is its project (.json, .tar), its CSV of all datasets, or two
+    columns without a header; its points are sorted and near-duplicates averaged (docs/digitise.md).
+    Points off the grid are interpolated onto the bins in log power, and in log frequency from a
+    logarithmic axis; bins that are not covered are left out, and power is rescaled to sum to 1 over
+    the others. The target's `notices` say which of these happened.
 
     **Arguments:**
 
     - `name_or_path`: see `list_targets` for the names.
     - `quantity` and `segments` (Welch segments of each trial) replace what the file says.
     - `dataset`: which of several datasets of a figure.
-    - `axis`: `"log-log"` if a figure's points are log10 of frequency [Hz] and of power, calibrated in decades.
+    - `axis`: `"log-log"` if a figure's points are log10 of frequency [Hz] and of power, calibrated
+      in decades.
 
-    **Raises:** `TargetError`, a `ValueError`, naming file and line or key, what is wrong and what is right.
+    **Raises:** `TargetError`, a `ValueError`, naming file and line or key, what is wrong and what
+    is right.
     """
     raw = read_target(name_or_path, dataset, axis)
     file, fields, notices = raw.file, raw.fields, raw.notices
@@ -310,8 +363,11 @@ def _words(value: str | tuple[int, ...]) -> str:
     return value if isinstance(value, str) else " + ".join(map(str, value))
 
 
-def _normalised(power: np.ndarray, sigma: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Both over the sum of the power, unless that is 1 to rounding: a saved target is read back exactly."""
+def _normalised(
+    power: np.ndarray, sigma: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Both over the sum of the power, unless that is 1 to rounding: a saved target is read back
+    exactly."""
     if not power.size:
         return check.frozen(power), None
     total = np.sum(power)
@@ -324,17 +380,27 @@ def _own_notices(target: Target, total: float) -> list[str]:
     missing = np.setdiff1d(np.arange(settings.first_bin, settings.last_bin + 1), target.bins)
     if missing.size and target.bins.size:
         runs = np.split(missing, np.flatnonzero(np.diff(missing) > 1) + 1)
-        spans = ", ".join(f"{run[0]}" if run.size == 1 else f"{run[0]} to {run[-1]}" for run in runs)
+        spans = ", ".join(
+            f"{run[0]}" if run.size == 1 else f"{run[0]} to {run[-1]}" for run in runs
+        )
         which, they = ("bin", "it is") if missing.size == 1 else ("the bins", "these are")
-        notices.append(f"the spectrum has no value in {which} {spans}, so {they} left out (bin k lies at k times "
-                       f"{settings.resolution:g} Hz)")  # fmt: skip
+        notices.append(
+            f"the spectrum has no value in {which} {spans}, so {they} left out (bin k lies at k"
+            f" times {settings.resolution:g} Hz)"
+        )
     if target.bins.size and abs(total - 1) > SUM_TOLERANCE:
-        notices.append(f"proportional power summed to {total:.4g} over the bins covered: rescaled to 1")
+        notices.append(
+            f"proportional power summed to {total:.4g} over the bins covered: rescaled to 1"
+        )
     if target.overdispersion > UNUSUAL and target.dispersion is not None:
-        notices.append(f"the spectra of the trials {_dispersion_in_words(target.dispersion)}. So all errors are widened by "
-                       "it. Did the person tire, drift or change the grip?")  # fmt: skip
+        notices.append(
+            f"the spectra of the trials {_dispersion_in_words(target.dispersion)}. So all errors"
+            " are widened by it. Did the person tire, drift or change the grip?"
+        )
     if target.provenance == "reconstructed":
         if target.reason is None:
-            raise TargetError("a reconstructed target needs a reason: a sentence that says what was assumed")
+            raise TargetError(
+                "a reconstructed target needs a reason: a sentence that says what was assumed"
+            )
         notices.append(f"reconstructed from what the text states, not measured: {target.reason}")
     return notices

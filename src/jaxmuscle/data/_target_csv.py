@@ -24,8 +24,8 @@ class Sheet(NamedTuple):
 def read_csv(text: str, file: str) -> Sheet:
     """Read `frequency_hz,proportional_power[,sigma]`, or two columns without a header.
 
-    Columns are separated by comma, semicolon, tab or blanks; but for the first the decimal sign may be a comma. `#`
-    starts a comment.
+    Columns are separated by comma, semicolon, tab or blanks; but for the first the decimal sign may
+    be a comma. `#` starts a comment.
 
     **Raises:** `TargetError` naming file and line.
     """
@@ -48,7 +48,8 @@ def read_csv(text: str, file: str) -> Sheet:
 
 
 def merge_duplicates(columns: Columns, tolerance: float) -> Columns:
-    """Sort by frequency and average rows that are within `tolerance` [Hz] of the first of their group."""
+    """Sort by frequency and average rows that are within `tolerance` [Hz] of the first of their
+    group."""
     order = np.lexsort((columns.power, columns.frequency))
     groups: list[list[int]] = []
     for row in order:
@@ -63,19 +64,26 @@ def merge_duplicates(columns: Columns, tolerance: float) -> Columns:
 
 def _delimiter(place: str, body: str, file: str) -> str | None:
     if "\t" in body.strip() and ";" in body:
-        raise TargetError(f"{file}, {place}: holds tabs and semicolons; use one of them between the columns")
+        raise TargetError(
+            f"{file}, {place}: holds tabs and semicolons; use one of them between the columns"
+        )
     found = next((sign for sign in SIGNS if sign in body.strip()), None)
     if found is None and len(body.split()) < 2:
-        raise TargetError(f"{file}, {place}: one column; separate frequency and power by comma, semicolon, tab or blanks")
+        raise TargetError(
+            f"{file}, {place}: one column; separate frequency and power by comma, semicolon, tab or"
+            " blanks"
+        )
     return found
 
 
 def _header(place: str, row: list[str], file: str) -> list[str]:
     names = [cell.lower() for cell in row]
     if not any(name.startswith(("freq", "prop", "power", "sigma")) for name in names):
-        raise TargetError(f"{file}, {place}: the columns are {', '.join(row)}; a spectrum has {NAMES[0]},{NAMES[1]}"
-                          "[,sigma]. Is this a recording? Then give it to `jaxmuscle analyse`, or read it with "
-                          "jaxmuscle.load_recording")  # fmt: skip
+        raise TargetError(
+            f"{file}, {place}: the columns are {', '.join(row)}; a spectrum has"
+            f" {NAMES[0]},{NAMES[1]}[,sigma]. Is this a recording? Then give it to `jaxmuscle"
+            " analyse`, or read it with jaxmuscle.load_recording"
+        )
     for name in names:
         if name not in NAMES:
             raise TargetError(f"{file}, {place}: unknown column {name!r}; {choices(name, NAMES)}")
@@ -83,14 +91,26 @@ def _header(place: str, row: list[str], file: str) -> list[str]:
             raise TargetError(f"{file}, {place}: column {name!r} appears twice; keep one")
     for name in NAMES[:2]:
         if name not in names:
-            raise TargetError(f"{file}, {place}: no column {name!r}; expected {NAMES[0]},{NAMES[1]}[,sigma]")
+            raise TargetError(
+                f"{file}, {place}: no column {name!r}; expected {NAMES[0]},{NAMES[1]}[,sigma]"
+            )
     return names
 
 
-def _numbers(place: str, row: list[str], names: list[str], delimiter: str | None, file: str) -> list[float]:
+def _numbers(
+    place: str, row: list[str], names: list[str], delimiter: str | None, file: str
+) -> list[float]:
     if len(row) != len(names):
-        remedy = "decimal commas need a semicolon or tab between the columns" if delimiter == "," else "check it"
-        remedy = "a third column needs a header naming it sigma, or " + remedy if len(row) == 3 else remedy
+        remedy = (
+            "decimal commas need a semicolon or tab between the columns"
+            if delimiter == ","
+            else "check it"
+        )
+        remedy = (
+            "a third column needs a header naming it sigma, or " + remedy
+            if len(row) == 3
+            else remedy
+        )
         raise TargetError(f"{file}, {place}: {len(row)} of {len(names)} columns found; {remedy}")
     for name, cell in zip(names, row, strict=True):
         if not is_number(cell, delimiter):

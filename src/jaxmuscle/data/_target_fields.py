@@ -1,4 +1,5 @@
-"""Checks of what a target is made of: the value in its stored form, or an error that says what is right."""
+"""Checks of what a target is made of: the value in its stored form, or an error that says what is
+right."""
 
 import math
 from collections.abc import Callable
@@ -25,7 +26,8 @@ MOST = 10**9  # segments of a trial
 
 
 class Columns(NamedTuple):
-    """Columns of equal length; `places` says for messages where each row stands ("line 7", "entry 7")."""
+    """Columns of equal length; `places` says for messages where each row stands ("line 7", "entry
+    7")."""
 
     frequency: Float[np.ndarray, " rows"]
     power: Float[np.ndarray, " rows"]
@@ -42,10 +44,13 @@ def check_columns(columns: Columns, file: str, *, ordered: bool) -> None:
     for i, place in enumerate(places):
         where = f"{file}, {place}"
         if not (math.isfinite(frequency[i]) and frequency[i] >= 0):
-            raise TargetError(f"{where}: frequency {frequency[i]:g} must be finite and not negative [Hz]")
+            raise TargetError(
+                f"{where}: frequency {frequency[i]:g} must be finite and not negative [Hz]"
+            )
         if frequency[i] > FASTEST / 2:
             raise TargetError(
-                f"{where}: frequency {frequency[i]:g} Hz is above {FASTEST / 2:g} Hz, half of the fastest rate"
+                f"{where}: frequency {frequency[i]:g} Hz is above {FASTEST / 2:g} Hz, half of the"
+                " fastest rate"
             )
         if not _usable(power[i]):
             problem = f"{where}: proportional_power {power[i]:g} must be finite and larger than 0"
@@ -55,7 +60,9 @@ def check_columns(columns: Columns, file: str, *, ordered: bool) -> None:
             raise TargetError(f"{problem}; leave sigma out altogether if it is not known")
         if ordered and i > 0 and frequency[i] <= frequency[i - 1]:
             fault = "appears twice" if frequency[i] in frequency[:i] else "is out of order"
-            raise TargetError(f"{where}: frequency {frequency[i]:g} Hz {fault}; sort, one row per frequency")
+            raise TargetError(
+                f"{where}: frequency {frequency[i]:g} Hz {fault}; sort, one row per frequency"
+            )
 
 
 def _usable(value: Any) -> Any:
@@ -64,7 +71,8 @@ def _usable(value: Any) -> Any:
 
 
 def is_number(value: Any) -> bool:
-    """Whether the value is a real number that a float can hold; `True` and `False` are not numbers here."""
+    """Whether the value is a real number that a float can hold; `True` and `False` are not numbers
+    here."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
         return False
     try:
@@ -74,8 +82,11 @@ def is_number(value: Any) -> bool:
     return True
 
 
-def numbers_of(key: str, values: Any, file: str, *, empty: bool = False) -> Float[np.ndarray, " rows"]:
-    """A list of numbers as an array, which may be `empty` or not. Raises `TargetError` naming the entry that is none."""
+def numbers_of(
+    key: str, values: Any, file: str, *, empty: bool = False
+) -> Float[np.ndarray, " rows"]:
+    """A list of numbers as an array, which may be `empty` or not. Raises `TargetError` naming the
+    entry that is none."""
     if not isinstance(values, list | tuple | np.ndarray) or not (empty or len(values)):
         raise TargetError(f"{file}: {key} must be a list of numbers")
     for i, value in enumerate(values, 1):
@@ -85,7 +96,8 @@ def numbers_of(key: str, values: Any, file: str, *, empty: bool = False) -> Floa
 
 
 def metadata(name: str, value: Any) -> Any:
-    """The value of the field `name` in its stored form: lists as tuples, `None` where it may be missing."""
+    """The value of the field `name` in its stored form: lists as tuples, `None` where it may be
+    missing."""
     return None if value is None and name in OPTIONAL else CHECKS[name](name, value)
 
 
@@ -114,7 +126,9 @@ def _count(name: str, value: Any) -> int:
 
 def _fraction(name: str, value: Any) -> float:
     if not (is_number(value) and 0 < value <= 1):
-        raise TargetError(f"{name} {value!r}: give a fraction above 0, at most 1, such as 0.0133 for 1.33 %")
+        raise TargetError(
+            f"{name} {value!r}: give a fraction above 0, at most 1, such as 0.0133 for 1.33 %"
+        )
     return float(value)
 
 
@@ -124,7 +138,9 @@ def _positive(name: str, value: Any) -> float:
     return float(value)
 
 
-def _each(check: Callable[[str, Any], Any], *, empty: bool = False) -> Callable[[str, Any], tuple[Any, ...]]:
+def _each(
+    check: Callable[[str, Any], Any], *, empty: bool = False
+) -> Callable[[str, Any], tuple[Any, ...]]:
     def check_each(name: str, value: Any) -> tuple[Any, ...]:
         values = value.tolist() if isinstance(value, np.ndarray) else value
         entries = values if isinstance(values, list | tuple) else [values]
@@ -149,7 +165,15 @@ CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "reason": _text,
     "notices": _each(_text, empty=True),
 }
-OPTIONAL = ("segments", "coefficient_of_variation", "mvc_fraction", "mean", "unit", "dispersion", "reason")
+OPTIONAL = (
+    "segments",
+    "coefficient_of_variation",
+    "mvc_fraction",
+    "mean",
+    "unit",
+    "dispersion",
+    "reason",
+)
 
 
 def bin_numbers(values: Any, settings: SpectrumSettings) -> Int[np.ndarray, " bins"]:
@@ -157,7 +181,9 @@ def bin_numbers(values: Any, settings: SpectrumSettings) -> Int[np.ndarray, " bi
     bins, (first, last) = np.array(values), (settings.first_bin, settings.last_bin)
     whole = bins.ndim == 1 and np.issubdtype(bins.dtype, np.integer)
     if not whole or np.any(np.diff(bins) < 1) or np.any(bins < first) or np.any(bins > last):
-        raise TargetError(f"bins {listed(bins.ravel())}: give increasing whole numbers from {first} to {last}")
+        raise TargetError(
+            f"bins {listed(bins.ravel())}: give increasing whole numbers from {first} to {last}"
+        )
     return bins.astype(int)
 
 
@@ -168,28 +194,45 @@ def positive(name: str, values: Any, size: int) -> Float[np.ndarray, " bins"]:
     except (TypeError, ValueError):
         raise TargetError(f"{name}: give numbers, one for each bin") from None
     if array.shape != (size,) or size < 2:
-        raise TargetError(f"{name} has shape {array.shape}; give one number for each of at least 2 bins ({size} here)")
+        raise TargetError(
+            f"{name} has shape {array.shape}; give one number for each of at least 2 bins ({size}"
+            " here)"
+        )
     if not np.all(_usable(array)):
-        raise TargetError(f"{name}: every value must be finite and larger than 0; leave out bins that are not known")
+        raise TargetError(
+            f"{name}: every value must be finite and larger than 0; leave out bins that are not"
+            " known"
+        )
     return array
 
 
-def trial_powers(values: Any, bins: int, segments: tuple[int, ...] | None, power: np.ndarray) -> np.ndarray:
-    """Spectra of trials, one row each, whose mean, weighted with their segments, has the shape of `power`."""
+def trial_powers(
+    values: Any, bins: int, segments: tuple[int, ...] | None, power: np.ndarray
+) -> np.ndarray:
+    """Spectra of trials, one row each, whose mean, weighted with their segments, has the shape of
+    `power`."""
     try:
         rows = np.array(values, dtype=float)
     except (TypeError, ValueError):
         raise TargetError("trial_power: give a row for each trial, a number for each bin") from None
     if segments is None or rows.shape != (len(segments), bins) or len(rows) < 2:
-        known = "no segments are stated" if segments is None else f"segments names {len(segments)} trials"
-        raise TargetError(f"trial_power has shape {rows.shape}, and {known}; give 2 rows or more, one for each entry of "
-                          f"segments, of {bins} bins each")  # fmt: skip
+        known = (
+            "no segments are stated"
+            if segments is None
+            else f"segments names {len(segments)} trials"
+        )
+        raise TargetError(
+            f"trial_power has shape {rows.shape}, and {known}; give 2 rows or more, one for each"
+            f" entry of segments, of {bins} bins each"
+        )
     if not np.all(_usable(rows)):
         raise TargetError("trial_power: every value must be finite and larger than 0")
     mean = np.average(rows, axis=0, weights=segments)
     if not np.allclose(mean / mean.sum(), power / power.sum(), rtol=1e-6):
-        raise TargetError("trial_power: its mean over the trials, weighted with their segments, is not proportional_power; "
-                          "leave one of both out or make it right")  # fmt: skip
+        raise TargetError(
+            "trial_power: its mean over the trials, weighted with their segments, is not"
+            " proportional_power; leave one of both out or make it right"
+        )
     return frozen(rows)
 
 

@@ -1,4 +1,5 @@
-"""Targets in files: a bundled name or a path to the fields and columns of a TOML, CSV or WebPlotDigitizer file."""
+"""Targets in files: a bundled name or a path to the fields and columns of a TOML, CSV or
+WebPlotDigitizer file."""
 
 import contextlib
 import os
@@ -35,16 +36,27 @@ from ._target_fields import (
 from ._text_tables import TEXT
 
 REQUIRED = ("name", "quantity", "provenance", "source", "frequency_hz", "proportional_power")
-METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "mean", "unit", "dispersion", "reason", "notices")
+METADATA = (
+    "segments",
+    "coefficient_of_variation",
+    "mvc_fraction",
+    "mean",
+    "unit",
+    "dispersion",
+    "reason",
+    "notices",
+)
 KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "stiffness", "settings")
 QUANTITIES, PROVENANCES = ("one of " + ", ".join(get_args(kind)) for kind in (Quantity, Provenance))
 POSITIVES = "numbers, each above 0"
 
 
 class Raw(NamedTuple):
-    """What a file says: its name for messages, its fields other than the columns, the columns, notices.
+    """What a file says: its name for messages, its fields other than the columns, the columns,
+    notices.
 
-    `digitised` points carry the error of a pixel; `log_frequency` says that their frequency axis is logarithmic.
+    `digitised` points carry the error of a pixel; `log_frequency` says that their frequency axis is
+    logarithmic.
     """
 
     file: str
@@ -55,8 +67,11 @@ class Raw(NamedTuple):
     log_frequency: bool = False
 
 
-def read_target(name_or_path: str | os.PathLike[str], dataset: str | None = None, axis: str = "linear") -> Raw:
-    """Read a bundled target, a .toml or .csv file or a digitised figure; the columns are checked, the other fields not yet.
+def read_target(
+    name_or_path: str | os.PathLike[str], dataset: str | None = None, axis: str = "linear"
+) -> Raw:
+    """Read a bundled target, a .toml or .csv file or a digitised figure; the columns are checked,
+    the other fields not yet.
 
     **Raises:** `TargetError` naming file and line or key.
     """
@@ -64,11 +79,18 @@ def read_target(name_or_path: str | os.PathLike[str], dataset: str | None = None
         raise TargetError(f"unknown axis {axis!r}; {choices(str(axis), AXES)}")
     file, kind, text = _read(name_or_path)
     if kind == ".json":
-        return _digitised(read_project(text, file, dataset), file, axis, f"WebPlotDigitizer project {Path(file).name}")
+        return _digitised(
+            read_project(text, file, dataset),
+            file,
+            axis,
+            f"WebPlotDigitizer project {Path(file).name}",
+        )
     if kind == ".csv" and (points := read_datasets(text, file, dataset)) is not None:
         return _digitised(points, file, axis, f"WebPlotDigitizer export {Path(file).name}")
     if dataset is not None:
-        raise TargetError(f"{file}: has no named datasets; leave dataset={dataset!r} (--dataset) out")
+        raise TargetError(
+            f"{file}: has no named datasets; leave dataset={dataset!r} (--dataset) out"
+        )
     return _parse_csv(text, file, axis) if kind == ".csv" else _parse_toml(text, file, axis)
 
 
@@ -80,9 +102,17 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, str, str]:
     if isinstance(name_or_path, str) and given in names:
         return given, ".toml", bundled_text(given)
     path = Path(given)
-    is_path = isinstance(name_or_path, os.PathLike) or path.suffix or len(path.parts) > 1 or os.path.exists(given)
+    is_path = (
+        isinstance(name_or_path, os.PathLike)
+        or path.suffix
+        or len(path.parts) > 1
+        or os.path.exists(given)
+    )
     if not given or not is_path:
-        raise TargetError(f"no bundled target {given!r}; {choices(given, names)} (`jaxmuscle targets`); or give a path")
+        raise TargetError(
+            f"no bundled target {given!r}; {choices(given, names)} (`jaxmuscle targets`); or give a"
+            " path"
+        )
     with contextlib.suppress(RuntimeError):
         path = path.expanduser()
     hint = f"; the bundled target is called {path.stem!r}" if path.stem in names else ""
@@ -104,13 +134,19 @@ def _parse_csv(text: str, file: str, axis: str) -> Raw:
         return _digitised(points, file, axis, comment or path.name)
     _linear(axis, file)
     check_columns(columns, file, ordered=True)
-    fields = {"name": printable(path.stem), "source": comment or printable(path.name), "settings": SpectrumSettings()}
+    fields = {
+        "name": printable(path.stem),
+        "source": comment or printable(path.name),
+        "settings": SpectrumSettings(),
+    }
     return Raw(file, fields, columns, [])
 
 
 def _linear(axis: str, file: str) -> None:
     if axis != "linear":
-        raise TargetError(f"{file}: states frequency in Hz and power; leave axis={axis!r} (--axis) out")
+        raise TargetError(
+            f"{file}: states frequency in Hz and power; leave axis={axis!r} (--axis) out"
+        )
 
 
 def _digitised(points: Points, file: str, axis: str, source: str) -> Raw:
@@ -120,7 +156,11 @@ def _digitised(points: Points, file: str, axis: str, source: str) -> Raw:
     merged = merge_duplicates(columns, GRID_TOLERANCE * settings.resolution)
     averaged = len(columns.places) - len(merged.places)
     origin = "no header" if points.dataset is None else f"dataset {points.dataset!r}"
-    what = "log10 of frequency in Hz and of power" if axis == "log-log" else "frequency in Hz and proportional power"
+    what = (
+        "log10 of frequency in Hz and of power"
+        if axis == "log-log"
+        else "frequency in Hz and proportional power"
+    )
     notice = f"{origin}: read as points of a figure, {what}, sorted by frequency"
     notice += f", {averaged} near-duplicates averaged" if averaged else ""
     source = source if points.dataset is None else f"{source}, dataset {points.dataset!r}"
@@ -140,14 +180,20 @@ def _parse_toml(text: str, file: str, axis: str) -> Raw:
     lists = [numbers_of(key, fields.pop(key), file, empty="stiffness" in fields) for key in keys]
     for key, values in zip(keys, lists, strict=True):
         if values.size != lists[0].size:
-            raise TargetError(f"{file}: {key} has {values.size} entries, frequency_hz {lists[0].size}; make them equal")
+            raise TargetError(
+                f"{file}: {key} has {values.size} entries, frequency_hz {lists[0].size}; make them"
+                " equal"
+            )
     places = tuple(f"entry {i}" for i in range(1, lists[0].size + 1))
     columns = Columns(lists[0], lists[1], lists[2] if len(lists) > 2 else None, places)
     check_columns(columns, file, ordered=True)
     stated = fields.get("settings", {})
     settings = fields["settings"] = settings_of(stated, f"{file}: [settings]")
     if "rate" in stated and columns.frequency.size and columns.frequency[-1] > settings.rate / 2:
-        said = f"{file}, {places[-1]}: frequency {columns.frequency[-1]:g} Hz is above {settings.rate / 2:g} Hz"
+        said = (
+            f"{file}, {places[-1]}: frequency {columns.frequency[-1]:g} Hz is above"
+            f" {settings.rate / 2:g} Hz"
+        )
         raise TargetError(f"{said}, half of the rate in [settings]; make one of both right")
     return Raw(file, fields, columns, [])
 
@@ -168,60 +214,103 @@ class TargetFile(Table, kw_only=True):
         ),
     ]
     proportional_power: Annotated[
-        Any, says("Power at each frequency, of any scale; empty if there is no spectrum", kind=f"list of {POSITIVES}")
+        Any,
+        says(
+            "Power at each frequency, of any scale; empty if there is no spectrum",
+            kind=f"list of {POSITIVES}",
+        ),
     ]
     sigma: Annotated[
         Any,
-        says("Standard error of each averaged power, in the unit of the power", missing="errors follow from `segments`",
-             kind=f"list of {POSITIVES}"),
-    ] = None  # fmt: skip
+        says(
+            "Standard error of each averaged power, in the unit of the power",
+            missing="errors follow from `segments`",
+            kind=f"list of {POSITIVES}",
+        ),
+    ] = None
     segments: Annotated[
         Any,
-        says("Welch segments that were averaged, of each trial; one number means one recording",
-             missing="errors follow from `sigma`; without it they are unknown, and so is chi²",
-             kind="whole number from 1, or a list of them"),
-    ] = None  # fmt: skip
+        says(
+            "Welch segments that were averaged, of each trial; one number means one recording",
+            missing="errors follow from `sigma`; without it they are unknown, and so is chi²",
+            kind="whole number from 1, or a list of them",
+        ),
+    ] = None
     coefficient_of_variation: Annotated[
         Any,
-        says("Standard deviation over mean, of each trial", missing="unknown",
-             kind="number above 0, at most 1, or a list of them"),
-    ] = None  # fmt: skip
+        says(
+            "Standard deviation over mean, of each trial",
+            missing="unknown",
+            kind="number above 0, at most 1, or a list of them",
+        ),
+    ] = None
     mvc_fraction: Annotated[
-        Any, says("Mean level as a share of the maximum", missing="unknown", kind="number above 0, at most 1")
+        Any,
+        says(
+            "Mean level as a share of the maximum",
+            missing="unknown",
+            kind="number above 0, at most 1",
+        ),
     ] = None
     mean: Annotated[
         Any,
-        says("Mean force or torque of each trial, in `unit`", missing="unknown", kind="number above 0, or a list of them"),
+        says(
+            "Mean force or torque of each trial, in `unit`",
+            missing="unknown",
+            kind="number above 0, or a list of them",
+        ),
     ] = None
-    unit: Annotated[Any, says("Unit of `mean`", missing="unknown: `mean` fixes no scale of force", kind="text")] = None
+    unit: Annotated[
+        Any, says("Unit of `mean`", missing="unknown: `mean` fixes no scale of force", kind="text")
+    ] = None
     dispersion: Annotated[
         Any,
-        says("Dispersion of the trials (1 if they are alike), and its error",
-             missing="follows from `trial_power`; else unknown", kind=f"list of two {POSITIVES}"),
-    ] = None  # fmt: skip
-    reason: Annotated[
-        Any, says("What was assumed", missing="nothing; an error if `provenance` is reconstructed", kind="text")
+        says(
+            "Dispersion of the trials (1 if they are alike), and its error",
+            missing="follows from `trial_power`; else unknown",
+            kind=f"list of two {POSITIVES}",
+        ),
     ] = None
-    notices: Annotated[Any, says("What was done to the numbers", missing="no notices", kind="list of texts")] = None
+    reason: Annotated[
+        Any,
+        says(
+            "What was assumed",
+            missing="nothing; an error if `provenance` is reconstructed",
+            kind="text",
+        ),
+    ] = None
+    notices: Annotated[
+        Any, says("What was done to the numbers", missing="no notices", kind="list of texts")
+    ] = None
     trial_power: Annotated[
         Any,
         says(
-            "Spectrum of each trial: a row for each of `segments`, with a power for each of `frequency_hz`, in one unit. "
-            "Weighted with `segments`, their mean has the shape of `proportional_power`",
+            "Spectrum of each trial: a row for each of `segments`, with a power for each of"
+            " `frequency_hz`, in one unit. Weighted with `segments`, their mean has the shape of"
+            " `proportional_power`",
             missing="unknown",
             kind=f"list of rows, each a list of {POSITIVES}",
         ),
     ] = None
     stiffness: Annotated[
-        Any, says("Dynamic stiffness measured beside it", missing="not measured", kind="table, see below")
+        Any,
+        says(
+            "Dynamic stiffness measured beside it", missing="not measured", kind="table, see below"
+        ),
     ] = None
     settings: Annotated[
-        Any, says("How the spectrum was estimated: the fields of `SpectrumSettings`", missing="their defaults", kind="table")
+        Any,
+        says(
+            "How the spectrum was estimated: the fields of `SpectrumSettings`",
+            missing="their defaults",
+            kind="table",
+        ),
     ] = None
 
 
 def fields_of(table: Mapping[str, Any], file: str, needed: Iterable[str] = ()) -> dict[str, Any]:
-    """The keys of a target's table, those that are checked alone in their stored form; what is not stated may be None.
+    """The keys of a target's table, those that are checked alone in their stored form; what is not
+    stated may be None.
 
     **Raises:** `TargetError` for a key that is unknown, missing or wrong.
     """
@@ -230,9 +319,15 @@ def fields_of(table: Mapping[str, Any], file: str, needed: Iterable[str] = ()) -
         if key not in table:
             raise TargetError(f"{file}: the key {key!r} is missing; needed are {', '.join(needed)}")
     if type(table.get("format", 1)) is not int or table.get("format", 1) != 1:
-        raise TargetError(f"{file}: format = {table['format']!r}: this version of jaxmuscle reads format 1")
+        raise TargetError(
+            f"{file}: format = {table['format']!r}: this version of jaxmuscle reads format 1"
+        )
     try:
-        fields = {key: metadata(key, value) if key in CHECKS else value for key, value in table.items() if key != "format"}
+        fields = {
+            key: metadata(key, value) if key in CHECKS else value
+            for key, value in table.items()
+            if key != "format"
+        }
     except TargetError as error:
         raise TargetError(f"{file}: {error}") from None
     return fields
@@ -241,11 +336,15 @@ def fields_of(table: Mapping[str, Any], file: str, needed: Iterable[str] = ()) -
 def settings_of(table: Any, where: str, needed: Iterable[str] = ()) -> SpectrumSettings:
     """Spectrum settings of a target's table. Raises `TargetError`."""
     if not isinstance(table, dict):
-        raise TargetError(f"{where}: settings must be a table: a line [settings], then one setting per line")
+        raise TargetError(
+            f"{where}: settings must be a table: a line [settings], then one setting per line"
+        )
     own = {field.encode_name for field in msgspec.structs.fields(TargetFile)}
     if misplaced := [key for key in table if key in own]:
         said = f"{where}: {', '.join(misplaced)}: of the target, not of its settings"
-        raise TargetError(f"{said}. Move this above the line [settings]: below it everything counts as a setting")
+        raise TargetError(
+            f"{said}. Move this above the line [settings]: below it everything counts as a setting"
+        )
     try:
         return SpectrumSettings.from_dict(table, needed=needed)
     except ValueError as error:
@@ -262,9 +361,11 @@ class OnBins(NamedTuple):
 
 
 def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
-    """The rows on the bins they cover: as they are if all lie on bins, else interpolated in log power; and notices.
+    """The rows on the bins they cover: as they are if all lie on bins, else interpolated in log
+    power; and notices.
 
-    Raises `TargetError` if fewer than 2 bins are covered, and for spectra of trials that are off the bins.
+    Raises `TargetError` if fewer than 2 bins are covered, and for spectra of trials that are off
+    the bins.
     """
     columns, settings, trials = raw.columns, raw.fields["settings"], raw.fields.get("trial_power")
     with np.errstate(over="ignore"):
@@ -279,12 +380,23 @@ def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
     if aligned:
         inside = (bins >= first) & (bins <= last)
         sigma = None if columns.sigma is None else columns.sigma[inside]
-        points = OnBins(bins[inside], columns.power[inside], sigma, None if trials is None else _columns(trials, inside))
+        points = OnBins(
+            bins[inside],
+            columns.power[inside],
+            sigma,
+            None if trials is None else _columns(trials, inside),
+        )
         if (off := np.max(np.abs(position - bins)[inside], initial=0)) > GRID_TOLERANCE:
-            notices.append(f"some frequencies lie up to {off:.2g} bins beside a bin, and count as that bin: a figure cannot "
-                           "be read more finely")  # fmt: skip
+            notices.append(
+                f"some frequencies lie up to {off:.2g} bins beside a bin, and count as that bin: a"
+                " figure cannot be read more finely"
+            )
         if not np.all(inside):
-            rows, are = ("1 row lies", "is") if np.sum(~inside) == 1 else (f"{np.sum(~inside)} rows lie", "are")
+            rows, are = (
+                ("1 row lies", "is")
+                if np.sum(~inside) == 1
+                else (f"{np.sum(~inside)} rows lie", "are")
+            )
             notices.append(f"{rows} outside bins {first} to {last} and {are} left out")
     elif trials is not None:
         raise TargetError("trial_power: needs frequencies that lie on the bins of the settings")
@@ -293,22 +405,34 @@ def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
         low, high = position[0] - tolerance[0], position[-1] + tolerance[-1]
         covered = every[(every >= low) & (every <= high)]
         logs = [np.log(values) for values in (columns.power, columns.sigma) if values is not None]
-        at, known = (np.log(covered), np.log(position)) if raw.log_frequency else (covered, position)
+        at, known = (
+            (np.log(covered), np.log(position)) if raw.log_frequency else (covered, position)
+        )
         points = OnBins(covered, *(np.exp(np.interp(at, known, log)) for log in logs))
-        gap, scale = f"{np.max(np.diff(columns.frequency), initial=0):.3g}", " over log frequency" * raw.log_frequency
-        notices.append(f"the frequencies are not those of the bins, so the log power was interpolated{scale} (widest gap "
-                       f"{gap} Hz)")  # fmt: skip
+        gap, scale = (
+            f"{np.max(np.diff(columns.frequency), initial=0):.3g}",
+            " over log frequency" * raw.log_frequency,
+        )
+        notices.append(
+            f"the frequencies are not those of the bins, so the log power was interpolated{scale}"
+            f" (widest gap {gap} Hz)"
+        )
     alone = "stiffness" in raw.fields and not columns.frequency.size
     if points.bins.size < 2 and not alone:
         raise TargetError(
-            f"covers {points.bins.size} of the bins {first} to {last} ({settings.frequency[0]:.4g} to "
-            f"{settings.frequency[-1]:.4g} Hz), at least 2 are needed; frequencies are in Hz"
+            f"covers {points.bins.size} of the bins {first} to {last} ({settings.frequency[0]:.4g}"
+            f" to {settings.frequency[-1]:.4g} Hz), at least 2 are needed; frequencies are in Hz"
         )
     return points, notices
 
 
 def _columns(rows: Any, inside: np.ndarray) -> list[list[float]]:
     """The trials' spectra on the bins that are kept."""
-    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != inside.size for row in rows):
-        raise TargetError(f"trial_power: every trial needs {inside.size} numbers, as many as proportional_power has")
+    if not isinstance(rows, list) or any(
+        not isinstance(row, list) or len(row) != inside.size for row in rows
+    ):
+        raise TargetError(
+            f"trial_power: every trial needs {inside.size} numbers, as many as"
+            " proportional_power has"
+        )
     return [[value for value, kept in zip(row, inside, strict=True) if kept] for row in rows]

@@ -1,4 +1,5 @@
-"""Text that holds a table: lines with comments, cells between delimiters, numbers with decimal commas."""
+"""Text that holds a table: lines with comments, cells between delimiters, numbers with decimal
+commas."""
 
 import csv
 from pathlib import Path
@@ -10,7 +11,8 @@ LOOK = 1 << 16  # bytes of a file that say what it is
 
 
 class Line(NamedTuple):
-    """A line of a file: its number, what is before the `#`, and the comment behind it, None without one."""
+    """A line of a file: its number, what is before the `#`, and the comment behind it, None without
+    one."""
 
     number: int
     body: str
@@ -24,24 +26,33 @@ class Line(NamedTuple):
 
 def lines_of(text: str) -> list[Line]:
     """All lines, whatever system wrote them."""
-    parts = (line.partition("#") for line in text.replace("\r\n", "\n").replace("\r", "\n").split("\n"))
-    return [Line(number, body, note if sign else None) for number, (body, sign, note) in enumerate(parts, 1)]
+    parts = (
+        line.partition("#") for line in text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    )
+    return [
+        Line(number, body, note if sign else None)
+        for number, (body, sign, note) in enumerate(parts, 1)
+    ]
 
 
 def cells_of(body: str, delimiter: str | None) -> list[str]:
-    """What stands between the delimiters (None: blanks), without blanks about it; quotes keep a delimiter as text."""
+    """What stands between the delimiters (None: blanks), without blanks about it; quotes keep a
+    delimiter as text."""
     if '"' not in body:
         cells = body.split(delimiter)
     else:
         try:
-            cells = next(csv.reader([body.strip(" ")], delimiter=delimiter or " ", skipinitialspace=True))
+            cells = next(
+                csv.reader([body.strip(" ")], delimiter=delimiter or " ", skipinitialspace=True)
+            )
         except csv.Error:
             return [body]
     return [cell.strip() for cell in cells]
 
 
 def number_in(cell: str, delimiter: str | None) -> float:
-    """The number of a cell; its decimal sign may be a comma unless that is the delimiter. Raises `ValueError`."""
+    """The number of a cell; its decimal sign may be a comma unless that is the delimiter. Raises
+    `ValueError`."""
     if "_" in cell:  # Python would take it as one between digits
         raise ValueError(f"{cell!r} is not a number")
     return float(cell if delimiter == "," else cell.replace(",", "."))
@@ -59,13 +70,22 @@ def is_number(cell: str, delimiter: str | None) -> bool:
 def width_remedy(delimiter: str | None) -> str:
     """What helps where a line has another number of columns than the rest."""
     remedy = "write a # before lines that are no data, or leave them out with `skip_rows`"
-    return f"decimal commas need a semicolon or tab between the columns; {remedy}" if delimiter == "," else remedy
+    return (
+        f"decimal commas need a semicolon or tab between the columns; {remedy}"
+        if delimiter == ","
+        else remedy
+    )
 
 
 def beginning(path: Path) -> tuple[list[str], list[str], str | None]:
-    """The first lines of a file that are not empty, the cells of the first in small letters, and the delimiter."""
+    """The first lines of a file that are not empty, the cells of the first in small letters, and
+    the delimiter."""
     with path.open("rb") as file:
         text = file.read(LOOK).decode("utf-8", errors="replace")
     rows = [line.body for line in lines_of(text) if line.body.strip()]
     delimiter = next((sign for sign in SIGNS if rows and sign in rows[0]), None)
-    return rows, [cell.casefold() for cell in cells_of(rows[0], delimiter)] if rows else [], delimiter
+    return (
+        rows,
+        [cell.casefold() for cell in cells_of(rows[0], delimiter)] if rows else [],
+        delimiter,
+    )

@@ -21,12 +21,14 @@ from ._target import Target
 
 
 class Trials(Shown, Sequence[Recording]):
-    """Trials of one person in one condition: a sequence of `Recording`s, which together give one `Target`.
+    """Trials of one person in one condition: a sequence of `Recording`s, which together give one
+    `Target`.
 
         trials = jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()
         result = jm.fit(jm.Isometric(), trials)
 
-    **Arguments:** `recordings`, one or more of the same unit. Their rates, lengths and windows may differ.
+    **Arguments:** `recordings`, one or more of the same unit. Their rates, lengths and windows may
+    differ.
 
     **Raises:** `ValueError` for none, for something else than recordings, and for different units.
     """
@@ -37,11 +39,18 @@ class Trials(Shown, Sequence[Recording]):
         self.recordings = tuple(recordings)
         require(len(self.recordings) > 0, "recordings", [], "give at least one")
         for other in self.recordings:
-            require(isinstance(other, Recording), "recordings", other, "give Recordings, as load_recording returns them")
+            require(
+                isinstance(other, Recording),
+                "recordings",
+                other,
+                "give Recordings, as load_recording returns them",
+            )
         units = dict.fromkeys(recording.unit for recording in self.recordings)
         if len(units) > 1:
-            raise ValueError(f"recordings: the units {' and '.join(units)} cannot be averaged; bring all trials to one unit "
-                             "(nothing is converted by itself)")  # fmt: skip
+            raise ValueError(
+                f"recordings: the units {' and '.join(units)} cannot be averaged; bring all trials"
+                " to one unit (nothing is converted by itself)"
+            )
 
     def __len__(self) -> int:
         return len(self.recordings)
@@ -54,7 +63,9 @@ class Trials(Shown, Sequence[Recording]):
     @overload
     def __getitem__(self, index: slice) -> "Trials": ...
     def __getitem__(self, index: int | slice) -> "Recording | Trials":
-        return Trials(self.recordings[index]) if isinstance(index, slice) else self.recordings[index]
+        return (
+            Trials(self.recordings[index]) if isinstance(index, slice) else self.recordings[index]
+        )
 
     @property
     def name(self) -> str:
@@ -74,29 +85,36 @@ class Trials(Shown, Sequence[Recording]):
         mvc: float | int | None = None,
         settings: SpectrumSettings | str | None = None,
     ) -> Target:
-        """One target: the absolute spectra P_i of the trials averaged, weighted with their Welch segments K_i, which add up.
+        """One target: the absolute spectra P_i of the trials averaged, weighted with their Welch
+        segments K_i, which add up.
 
             p_k ∝ Σ_i K_i P_ik / Σ_i K_i
 
-        The target states the segments of every trial; of a force or torque also its mean and coefficient of variation. It
-        keeps the spectra of several trials. Their scatter gives the dispersion: how much more the trials differ than their
-        segments explain (`Target.dispersion`).
+        The target states the segments of every trial; of a force or torque also its mean and
+        coefficient of variation. It keeps the spectra of several trials. Their scatter gives the
+        dispersion: how much more the trials differ than their segments explain
+        (`Target.dispersion`).
 
         **Arguments:**
 
         - `name`: or what the trials' names have in common
         - `quantity`: or that of the unit
         - `provenance`
-        - `mvc` [`unit`]: the maximal voluntary contraction, for the level (recordings in % MVC need none)
+        - `mvc` [`unit`]: the maximal voluntary contraction, for the level (recordings in % MVC need
+          none)
         - `settings`: by default those of `Recording.spectrum`
 
-        **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as `Recording.spectrum` does.
+        **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as
+        `Recording.spectrum` does.
         """
         called = self.name if name is None else name
-        return pooled_target(self.recordings, called, quantity, provenance, mvc, recorded_settings(settings))
+        return pooled_target(
+            self.recordings, called, quantity, provenance, mvc, recorded_settings(settings)
+        )
 
     def spectrum(self, settings: SpectrumSettings | str | None = None) -> Spectrum:
-        """The mean of the recordings' spectra (`Recording.spectrum`), weighted with their Welch segments."""
+        """The mean of the recordings' spectra (`Recording.spectrum`), weighted with their Welch
+        segments."""
         each, weights = [r.spectrum(settings) for r in self], [r.segments(settings) for r in self]
         power = np.average([one.power for one in each], axis=0, weights=weights)
         return Spectrum(each[0].frequency, power, each[0].settings, each[0].unit)
@@ -104,15 +122,25 @@ class Trials(Shown, Sequence[Recording]):
     def _notices(self, settings: SpectrumSettings | str | None = None) -> tuple[str, ...]:
         """What to mind of the recordings and their windows."""
         chosen, quantity = recorded_settings(settings), self.recordings[0].quantity
-        return notices_of(self.recordings, [r.filtered(chosen) for r in self], chosen.rate, [()] * len(self), quantity)
+        return notices_of(
+            self.recordings,
+            [r.filtered(chosen) for r in self],
+            chosen.rate,
+            [()] * len(self),
+            quantity,
+        )
 
     def plot(self, settings: SpectrumSettings | str | None = None, ax: Any = None) -> Any:
-        """Draw the windows and the spectra of the recordings; a single one as by `Recording.plot`. Returns the figure."""
+        """Draw the windows and the spectra of the recordings; a single one as by `Recording.plot`.
+        Returns the figure."""
         return plot.trials(self, settings, ax)
 
     def _card(self) -> Card:
         head = f"{self.name}: {len(self)} recordings [{self.recordings[0].unit}]"
-        rows = tuple((r.name, r.window_in_words, f"{np.mean(r.samples):.4g} {r.unit}") for r in self.recordings)
+        rows = tuple(
+            (r.name, r.window_in_words, f"{np.mean(r.samples):.4g} {r.unit}")
+            for r in self.recordings
+        )
         lines = [f"  {name}: {window}, mean {mean}" for name, window, mean in rows]
         return Card(folded([head, *lines]), head, ("recording", "window", "mean"), rows)
 
@@ -137,20 +165,37 @@ def load_recordings(
 
     **Arguments:**
 
-    - `paths`: a list of files, or the path of one file that has a column for each trial (or what `jaxmuscle.data.read_table`
-      read of them)
-    - `columns`: which columns of this one file are trials (by default all with numbers but the time)
-    - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap`, `lever_arm`: as in `load_recording`,
-      the same for all files
+    - `paths`: a list of files, or the path of one file that has a column for each trial (or what
+      `jaxmuscle.data.read_table` read of them)
+    - `columns`: which columns of this one file are trials (by default all with numbers but the
+      time)
+    - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap`, `lever_arm`:
+      as in `load_recording`, the same for all files
 
-    **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does, and for different units.
+    **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does,
+    and for different units.
     """
-    options: dict[str, Any] = {"rate": rate, "units": units, "axis": axis, "reference": reference, "time": time,
-                               "skip_rows": skip_rows, "max_gap": max_gap, "lever_arm": lever_arm}  # fmt: skip
+    options: dict[str, Any] = {
+        "rate": rate,
+        "units": units,
+        "axis": axis,
+        "reference": reference,
+        "time": time,
+        "skip_rows": skip_rows,
+        "max_gap": max_gap,
+        "lever_arm": lever_arm,
+    }
     if isinstance(paths, str | os.PathLike | Table):
-        require(column is None, "column", column, "one file holds all trials here; name several with `columns`")
+        require(
+            column is None,
+            "column",
+            column,
+            "one file holds all trials here; name several with `columns`",
+        )
         return Trials(load_columns(paths, columns, **options))
     files = list(paths)
     if columns is not None:
-        raise ValueError("columns: these are for one file that holds all trials; give its path alone, as a text")
+        raise ValueError(
+            "columns: these are for one file that holds all trials; give its path alone, as a text"
+        )
     return Trials(load_recording(path, column=column, **options) for path in files)

@@ -21,9 +21,14 @@ def variables_of(layout: Layout, *, states: bool) -> tuple[dict[str, Variable], 
     found = {
         "seed": Variable(("seed",), (seeds,), (seeds,), np.int64, "", np.asarray(layout.seeds)),
         "time": Variable(("time",), (time_.size,), (time_.size,), float, "s", time_),
-        task.output_name: Variable((*lead, "seed", "time"), (*shape, seeds, time_.size), (*cut, width, time_.size), dtype,
-                                   task.output_unit),
-    }  # fmt: skip
+        task.output_name: Variable(
+            (*lead, "seed", "time"),
+            (*shape, seeds, time_.size),
+            (*cut, width, time_.size),
+            dtype,
+            task.output_unit,
+        ),
+    }
     units = zip(task.state_names, task.state_units, strict=True) if states else ()
     for name, unit in units:
         found.setdefault(name, found[task.output_name]._replace(units=unit))
@@ -31,13 +36,20 @@ def variables_of(layout: Layout, *, states: bool) -> tuple[dict[str, Variable], 
     if layout.bins:
         bins, frequency = layout.bins, task.settings.frequency
         found["frequency"] = Variable(("frequency",), (bins,), (bins,), float, "Hz", frequency)
-        found["power"] = Variable((*lead, "seed", "frequency"), (*shape, seeds, bins), (*cut, width, bins), dtype,
-                                  squared(task.output_unit) + "/Hz")  # fmt: skip
+        found["power"] = Variable(
+            (*lead, "seed", "frequency"),
+            (*shape, seeds, bins),
+            (*cut, width, bins),
+            dtype,
+            squared(task.output_unit) + "/Hz",
+        )
         coordinates.append("frequency")
     if isinstance(layout.task, Sweep):
         for name, values in layout.task.labels.items():
             unit = PARAMETERS[name].unit if name in PARAMETERS else ""
-            found[name] = Variable(("point",), values.shape, values.shape, values.dtype, unit, values)
+            found[name] = Variable(
+                ("point",), values.shape, values.shape, values.dtype, unit, values
+            )
             coordinates.append(name)
     return found, coordinates
 
@@ -51,7 +63,10 @@ def region_of(
     if states:
         for i, name in enumerate(task.state_names):
             parts.setdefault(name, found["states"][..., i])
-    region = slice(chunk.points.start, chunk.points.stop), slice(chunk.seeds.start, chunk.seeds.stop)
+    region = (
+        slice(chunk.points.start, chunk.points.stop),
+        slice(chunk.seeds.start, chunk.seeds.stop),
+    )
     if not isinstance(layout.task, Sweep):
         return region[1:], {name: values[0] for name, values in parts.items()}
     return region, parts

@@ -20,7 +20,17 @@ from jaxmuscle.response._linearised import LinearTask
 from jaxmuscle.simulation._simulate import DT, DURATION, require_finite, trajectories
 from jaxmuscle.simulation._trajectory import Trajectory
 
-from ._layout import Layout, Pace, Watch, companions, covers_window, cut_of, laid_out, plan_of, run_chunks
+from ._layout import (
+    Layout,
+    Pace,
+    Watch,
+    companions,
+    covers_window,
+    cut_of,
+    laid_out,
+    plan_of,
+    run_chunks,
+)
 from ._parts import Part, PartReport
 from ._places import place_of
 from ._run import reduced, stored
@@ -40,29 +50,66 @@ Progress = bool | Callable[[str, float], None] | Watch
 
 
 @overload
-def ensemble(task: AbstractTask, key: Key, *, seeds: Seeds, reduce: Literal[False] = ..., store: None = ...,
-             **given: Any) -> Trajectory: ...  # fmt: skip
+def ensemble(
+    task: AbstractTask,
+    key: Key,
+    *,
+    seeds: Seeds,
+    reduce: Literal[False] = ...,
+    store: None = ...,
+    **given: Any,
+) -> Trajectory: ...
 
 
 @overload
-def ensemble(task: Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds, reduce: Literal[False] = ...,
-             store: None = ..., **given: Any) -> Population: ...  # fmt: skip
+def ensemble(
+    task: Sweep | Sequence[AbstractTask],
+    key: Key,
+    *,
+    seeds: Seeds,
+    reduce: Literal[False] = ...,
+    store: None = ...,
+    **given: Any,
+) -> Population: ...
 
 
 @overload
-def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds, store: str | Path,
-             part: tuple[int, int], reduce: bool | tuple[float, ...] = ..., **given: Any) -> PartReport: ...  # fmt: skip
+def ensemble(
+    task: AbstractTask | Sweep | Sequence[AbstractTask],
+    key: Key,
+    *,
+    seeds: Seeds,
+    store: str | Path,
+    part: tuple[int, int],
+    reduce: bool | tuple[float, ...] = ...,
+    **given: Any,
+) -> PartReport: ...
 
 
 @overload
-def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds,
-             reduce: Literal[True] | tuple[float, ...], store: str | Path | None = ..., part: None = ...,
-             **given: Any) -> EnsembleSummary: ...  # fmt: skip
+def ensemble(
+    task: AbstractTask | Sweep | Sequence[AbstractTask],
+    key: Key,
+    *,
+    seeds: Seeds,
+    reduce: Literal[True] | tuple[float, ...],
+    store: str | Path | None = ...,
+    part: None = ...,
+    **given: Any,
+) -> EnsembleSummary: ...
 
 
 @overload
-def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds, store: str | Path,
-             reduce: Literal[False] = ..., part: None = ..., **given: Any) -> "xarray.Dataset": ...  # fmt: skip
+def ensemble(
+    task: AbstractTask | Sweep | Sequence[AbstractTask],
+    key: Key,
+    *,
+    seeds: Seeds,
+    store: str | Path,
+    reduce: Literal[False] = ...,
+    part: None = ...,
+    **given: Any,
+) -> "xarray.Dataset": ...
 
 
 def ensemble(  # pyright: ignore[reportInconsistentOverload]
@@ -88,47 +135,54 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     generator: str = "hash",
     threads: int | None = None,
 ) -> Any:
-    """Simulate many seeds (0 to seeds - 1, or those given) of one task, or of every point of a sweep.
+    """Simulate many seeds (0 to seeds - 1, or those given) of one task, or of every point of a
+    sweep.
 
         runs = jm.ensemble(jm.Isometric(), jax.random.key(0), seeds=100)
         runs.spectrum().plot()
 
-    Seed i is `simulate(..., seed=i)`, whatever the chunk, the devices or the number of processes. Chunks run on all GPUs of
-    this process. Without a GPU they run on all cores of the CPU that the process may use, or on so many as `threads` says.
+    Seed i is `simulate(..., seed=i)`, whatever the chunk, the devices or the number of processes.
+    Chunks run on all GPUs of this process. Without a GPU they run on all cores of the CPU that the
+    process may use, or on so many as `threads` says.
 
     **Arguments:**
 
     - `task`: or a `Sweep`, or tasks that differ in numbers only
     - `key`, `duration` [s], `dt` [s], `rate` [Hz], `substeps`, `sampling`: as in `simulate`
     - `chunk`: how many seeds (points times seeds) run at once
-    - `progress`: True for a bar; or a function of (text, share), the share of the work that is done, from 0 to 1; or a
-      `Watch`
+    - `progress`: True for a bar; or a function of (text, share), the share of the work that is
+      done, from 0 to 1; or a `Watch`
 
-    `control` carries the linearised task along on the same noise paths, as control variate for the mean spectrum; None
-    does so wherever it pays: the run covers the analysed window and the task has a stable equilibrium whose transients
-    have decayed there.
+    `control` carries the linearised task along on the same noise paths, as control variate for the
+    mean spectrum; None does so wherever it pays: the run covers the analysed window and the task
+    has a stable equilibrium whose transients have decayed there.
 
-    `reduce`, True or the levels of the quantiles, keeps moments, quantiles and the mean spectrum only: memory does not
-    depend on the number of seeds. `store`, the folder or URL (fsspec's, as s3://...) of a zarr store, streams every chunk
-    there (`states` with it), or what is reduced from time to time; with `resume` an interrupted one is continued, with
-    `overwrite` an older ensemble is replaced. Under `jax.distributed` all processes make the same call and share its chunks;
-    all must see the store.
+    `reduce`, True or the levels of the quantiles, keeps moments, quantiles and the mean spectrum
+    only: memory does not depend on the number of seeds. `store`, the folder or URL (fsspec's, as
+    s3://...) of a zarr store, streams every chunk there (`states` with it), or what is reduced from
+    time to time; with `resume` an interrupted one is continued, with `overwrite` an older ensemble
+    is replaced. Under `jax.distributed` all processes make the same call and share its chunks; all
+    must see the store.
 
-    `part=(i, n)` computes the i-th (from 1) of n parts of a store. The parts are processes that do not know of each other.
-    They may run in any order or at once. One that was killed, or is repeated, goes on where it was, `resume` or not. In the
-    end `jaxmuscle.ensembles.merge(store)` makes one ensemble of all.
+    `part=(i, n)` computes the i-th (from 1) of n parts of a store. The parts are processes that do
+    not know of each other. They may run in any order or at once. One that was killed, or is
+    repeated, goes on where it was, `resume` or not. In the end `jaxmuscle.ensembles.merge(store)`
+    makes one ensemble of all.
 
-    `increments="weak"` takes numbers of 256 values with the first seven moments of a normal instead of normals, which is
-    faster. Expectations keep their order in dt, paths mean nothing: with `reduce` only, and quantiles from 1 to 99 %.
-    `generator`, "hash" (counter-based, see `docs/engine.md`) or "threefry" (JAX's own, slower), makes other noise.
+    `increments="weak"` takes numbers of 256 values with the first seven moments of a normal instead
+    of normals, which is faster. Expectations keep their order in dt, paths mean nothing: with
+    `reduce` only, and quantiles from 1 to 99 %. `generator`, "hash" (counter-based, see
+    `docs/engine.md`) or "threefry" (JAX's own, slower), makes other noise.
 
-    **Returns:** a `Trajectory`, of a sweep a `Population`; with `reduce` an `EnsembleSummary`; with `store` alone the opened
-    `xarray.Dataset` (dimensions (point,) seed, time, frequency); with `part` always a `PartReport`. A merged store is opened
-    by the same call without `part`, with `resume`.
+    **Returns:** a `Trajectory`, of a sweep a `Population`; with `reduce` an `EnsembleSummary`; with
+    `store` alone the opened `xarray.Dataset` (dimensions (point,) seed, time, frequency); with
+    `part` always a `PartReport`. A merged store is opened by the same call without `part`, with
+    `resume`.
 
-    **Raises:** as `simulate`: what does not stay finite is an error that names every such seed; with `reduce` or `store` it
-    is left out, or NaN, and listed in `failed`. `ValueError` for a store that exists already or was made with other
-    settings; `OSError` for one that cannot be written; `ProcessLostError` if another process died.
+    **Raises:** as `simulate`: what does not stay finite is an error that names every such seed;
+    with `reduce` or `store` it is left out, or NaN, and listed in `failed`. `ValueError` for a
+    store that exists already or was made with other settings; `OSError` for one that cannot be
+    written; `ProcessLostError` if another process died.
     """
     if not isinstance(task, Sweep):
         for each in task if isinstance(task, list | tuple) else [task]:
@@ -145,19 +199,27 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     if threads is not None:
         count("threads", threads, 1, 1024)
     if resume and overwrite:
-        raise ValueError("resume (--resume) continues a store, overwrite (--force) replaces it: give one of the two")
+        raise ValueError(
+            "resume (--resume) continues a store, overwrite (--force) replaces it: give one of"
+            " the two"
+        )
     if (resume or states) and store is None:
-        raise ValueError(f"{'resume' if resume else 'states'} = True belongs to a store: give store=")
+        raise ValueError(
+            f"{'resume' if resume else 'states'} = True belongs to a store: give store="
+        )
     levels, draws = _levels(reduce), Draws.of(generator, increments)
     if draws.increments == "weak":
         _check_weak(levels)
     place = None if store is None else place_of(store)
-    mine = None if part is None else Part.checked(part, store=store is not None, overwrite=overwrite)
+    mine = (
+        None if part is None else Part.checked(part, store=store is not None, overwrite=overwrite)
+    )
     plan = plan_of(task, duration, dt, rate, substeps, sampling)
     if not all_concrete((task, key)):
         if isinstance(task, Sweep) or levels or store is not None:
             raise ValueError(
-                "under a JAX transformation an ensemble can be of one task, in memory: no sweep, reduce or store"
+                "under a JAX transformation an ensemble can be of one task, in memory: no sweep,"
+                " reduce or store"
             )
         linear = LinearTask.of(as_arrays(task)) if control else None
         return trajectories(task, linear, key, jnp.asarray(np.asarray(numbers)), plan, draws=draws)
@@ -168,10 +230,29 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     again = chunk is None and (resume or mine is not None)
     cut = begun_with(place) if place is not None and again else None
     if cut is None:
-        cut = cut_of(task, len(numbers), plan, chunk, shared=place is not None, parts=None if mine is None else mine.of)
-    layout = laid_out(task, key, numbers, plan, linear, cut=cut, states=whole, spectrum=spectrum, draws=draws,
-                      threads=threads)  # fmt: skip
-    begin = "part" if mine is not None else "resume" if resume else "overwrite" if overwrite else "new"
+        cut = cut_of(
+            task,
+            len(numbers),
+            plan,
+            chunk,
+            shared=place is not None,
+            parts=None if mine is None else mine.of,
+        )
+    layout = laid_out(
+        task,
+        key,
+        numbers,
+        plan,
+        linear,
+        cut=cut,
+        states=whole,
+        spectrum=spectrum,
+        draws=draws,
+        threads=threads,
+    )
+    begin = (
+        "part" if mine is not None else "resume" if resume else "overwrite" if overwrite else "new"
+    )
     with telling(progress, layout) as tell:
         if levels is not None:
             return reduced(layout, levels, place, tell, begin=begin, part=mine)
@@ -181,15 +262,26 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
 
 
 def runs_for_means(task: AbstractTask, key: Key, seeds: int, draws: Draws) -> Trajectory:
-    """Seeds 0 to seeds - 1 as `ensemble` simulates them, with weak numbers, too: for means over the seeds alone.
+    """Seeds 0 to seeds - 1 as `ensemble` simulates them, with weak numbers, too: for means over the
+    seeds alone.
 
     `AT_ONCE` of them at once: one program for any number, and each core of a CPU has some.
     """
     plan = plan_of(task, DURATION, DT, None, None, None)
     cut = cut_of(task, seeds, plan, AT_ONCE, shared=False)
     linear = companions(task, DURATION, None)
-    layout = laid_out(task, key_of(key), range(seeds), plan, linear, cut=cut, states=True, spectrum=False, draws=draws,
-                      threads=None)  # fmt: skip
+    layout = laid_out(
+        task,
+        key_of(key),
+        range(seeds),
+        plan,
+        linear,
+        cut=cut,
+        states=True,
+        spectrum=False,
+        draws=draws,
+        threads=None,
+    )
     found = _in_memory(layout, lambda pace: None)
     assert isinstance(found, Trajectory)
     return found
@@ -200,24 +292,36 @@ def _levels(reduce: bool | tuple[float, ...]) -> tuple[float, ...] | None:
     if reduce is False:
         return None
     levels = LEVELS if reduce is True else reduce
-    if not isinstance(levels, tuple | list) or not levels or not all(is_real(level) and 0 < level < 1 for level in levels):
+    if (
+        not isinstance(levels, tuple | list)
+        or not levels
+        or not all(is_real(level) and 0 < level < 1 for level in levels)
+    ):
         raise ValueError(f"reduce = {reduce}: levels of quantiles lie between 0 and 1")
     return tuple(sorted(map(float, levels)))
 
 
 def _check_weak(levels: tuple[float, ...] | None) -> None:
     if levels is None:
-        raise ValueError('increments = "weak" is for expectations, its paths mean nothing: give reduce=True (--reduce)')
+        raise ValueError(
+            'increments = "weak" is for expectations, its paths mean nothing: give reduce=True'
+            " (--reduce)"
+        )
     outside = [level for level in levels if not FURTHEST <= level <= 1 - FURTHEST]
     if outside:
-        raise ValueError(f'reduce = {levels} with increments = "weak": quantiles beyond {FURTHEST:g} and {1 - FURTHEST:g} '
-                         f"depend on the tails of single increments ({listed(outside)}): leave increments out")  # fmt: skip
+        raise ValueError(
+            f'reduce = {levels} with increments = "weak": quantiles beyond {FURTHEST:g} and'
+            f" {1 - FURTHEST:g} depend on the tails of single increments ({listed(outside)}): leave"
+            " increments out"
+        )
 
 
 def _in_memory(layout: Layout, tell: Callable[[Pace], None]) -> Trajectory | Population:
     """Everything, joined; a sweep point by point."""
     names = ("states", "output", *(("linear",) if layout.linear is not None else ()))
-    parts: list[dict[str, list[np.ndarray]]] = [{name: [] for name in names} for _ in range(layout.points)]
+    parts: list[dict[str, list[np.ndarray]]] = [
+        {name: [] for name in names} for _ in range(layout.points)
+    ]
     for chunk, found in run_chunks(layout, range(layout.chunks), tell):
         for row, point in enumerate(chunk.points):
             for name in names:
@@ -225,11 +329,26 @@ def _in_memory(layout: Layout, tell: Callable[[Pace], None]) -> Trajectory | Pop
     grid, plan, seeds = layout.plan.grid, layout.plan, np.asarray(layout.seeds)
     members = []
     for point, part in enumerate(parts):
-        joined = {name: rows[0] if len(rows) == 1 else np.concatenate(rows) for name, rows in part.items()}
-        members.append(Trajectory(layout.task_of(point), joined["states"], joined["output"], seeds, plan.rate, grid.dt,
-                                  grid.substeps, plan.sampling, joined.get("linear")))  # fmt: skip
+        joined = {
+            name: rows[0] if len(rows) == 1 else np.concatenate(rows) for name, rows in part.items()
+        }
+        members.append(
+            Trajectory(
+                layout.task_of(point),
+                joined["states"],
+                joined["output"],
+                seeds,
+                plan.rate,
+                grid.dt,
+                grid.substeps,
+                plan.sampling,
+                joined.get("linear"),
+            )
+        )
         part.clear()
-        require_finite(members[-1], f" at point {point} of the sweep" if isinstance(layout.task, Sweep) else "")
+        require_finite(
+            members[-1], f" at point {point} of the sweep" if isinstance(layout.task, Sweep) else ""
+        )
     return Population(layout.task, tuple(members)) if isinstance(layout.task, Sweep) else members[0]
 
 

@@ -1,4 +1,5 @@
-"""Whether a store holds what was written: checksums of its description, its progress and every chunk of its arrays."""
+"""Whether a store holds what was written: checksums of its description, its progress and every
+chunk of its arrays."""
 
 import hashlib
 import itertools
@@ -33,7 +34,8 @@ def unsealed(data: bytes) -> bytes | None:
 
 
 def stamped(document: Document) -> Document:
-    """The description of a store with a checksum of it; attributes that users add later do not count."""
+    """The description of a store with a checksum of it; attributes that users add later do not
+    count."""
     names = sorted(document["attributes"].keys() - {CHECKSUM})
     made = {"of": names, "sha256": _digest(document, names)}
     return document | {"attributes": document["attributes"] | {CHECKSUM: json.dumps(made)}}
@@ -53,8 +55,11 @@ def require_intact(place: AbstractPlace, document: Document) -> None:
     except (ValueError, KeyError, TypeError, AttributeError):
         intact = False
     if not intact:
-        raise StoreError(f"{place.name}: its description ({ROOT}) is damaged, or of an earlier version of jaxmuscle: its "
-                         "checksum is missing or wrong. Take a copy, or begin anew (--force, overwrite=True)")  # fmt: skip
+        raise StoreError(
+            f"{place.name}: its description ({ROOT}) is damaged, or of an earlier version of"
+            " jaxmuscle: its checksum is missing or wrong. Take a copy, or begin anew (--force,"
+            " overwrite=True)"
+        )
 
 
 def described(document: Document) -> dict[str, Document]:
@@ -79,11 +84,16 @@ def keys_of_array(document: Document, name: str) -> Iterator[str]:
 def _of_seeds(document: Document) -> dict[str, list[range]]:
     """The arrays that have a chunk for each chunk of the ensemble, and their grids."""
     found = described(document).items()
-    return {name: _grid(about) for name, about in found if "seed" in about.get("dimension_names", ())[:-1]}
+    return {
+        name: _grid(about)
+        for name, about in found
+        if "seed" in about.get("dimension_names", ())[:-1]
+    }
 
 
 def keys_of_chunk(document: Document, number: int) -> list[str]:
-    """Keys that a chunk of the ensemble fills in a store of trajectories: chunks go through the seeds, then the points."""
+    """Keys that a chunk of the ensemble fills in a store of trajectories: chunks go through the
+    seeds, then the points."""
     keys = []
     for name, (*lead, _) in _of_seeds(document).items():
         row, column = divmod(number, len(lead[-1]))
@@ -110,13 +120,19 @@ def damaged(place: AbstractPlace, keys: Iterable[str]) -> list[str]:
 
 
 def _good(chunk: bytes | None) -> bool:
-    return chunk is not None and google_crc32c.value(chunk[:-CRC]) == int.from_bytes(chunk[-CRC:], "little")
+    return chunk is not None and google_crc32c.value(chunk[:-CRC]) == int.from_bytes(
+        chunk[-CRC:], "little"
+    )
 
 
 def misdescribed(place: AbstractPlace, document: Document) -> list[str]:
-    """Keys of descriptions of single arrays that are not the ones in the store's own description."""
-    return [key for name, about in described(document).items()
-            if _parsed(place.read(key := f"{name}/{ROOT}")) != about]  # fmt: skip
+    """Keys of descriptions of single arrays that are not the ones in the store's own
+    description."""
+    return [
+        key
+        for name, about in described(document).items()
+        if _parsed(place.read(key := f"{name}/{ROOT}")) != about
+    ]
 
 
 def _parsed(data: bytes | None) -> Any:
@@ -131,8 +147,11 @@ def others(document: Document) -> list[str]:
     return [name for name in described(document) if name not in _of_seeds(document)]
 
 
-def wrong(place: AbstractPlace, document: Document, names: Iterable[str] | None = None) -> list[str]:
-    """Keys of a store that are missing or damaged: of all arrays, or of these; descriptions always."""
+def wrong(
+    place: AbstractPlace, document: Document, names: Iterable[str] | None = None
+) -> list[str]:
+    """Keys of a store that are missing or damaged: of all arrays, or of these; descriptions
+    always."""
     arrays = described(document) if names is None else names
     return misdescribed(place, document) + damaged(
         place, itertools.chain.from_iterable(keys_of_array(document, name) for name in arrays)
@@ -141,4 +160,6 @@ def wrong(place: AbstractPlace, document: Document, names: Iterable[str] | None 
 
 def in_words(keys: list[str]) -> str:
     """How many keys are wrong, and the first of them."""
-    return f"{len(keys)} damaged or missing ({', '.join(keys[:3])}{', ...' if len(keys) > 3 else ''})"
+    return (
+        f"{len(keys)} damaged or missing ({', '.join(keys[:3])}{', ...' if len(keys) > 3 else ''})"
+    )

@@ -21,7 +21,16 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._linearised import LinearTask
-from jaxmuscle.simulation._batch import LANES, THREADED, Recipe, blocks, local_mesh, run_points, run_seeds, threads_of
+from jaxmuscle.simulation._batch import (
+    LANES,
+    THREADED,
+    Recipe,
+    blocks,
+    local_mesh,
+    run_points,
+    run_seeds,
+    threads_of,
+)
 from jaxmuscle.simulation._simulate import Schedule, companion, schedule
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -30,8 +39,8 @@ from ._sweep import Sweep
 
 BLOCKS = 4
 STEPS_AT_ONCE = 4_000_000
-# Of a GPU, which hides its latency by many lanes and has memory for them. With 16 384 and 65 536 an H100 was as fast, with
-# 4096 nearly three times slower.
+# Of a GPU, which hides its latency by many lanes and has memory for them. With 16 384 and 65 536 an
+# H100 was as fast, with 4096 nearly three times slower.
 WIDE_LANES, WIDE_STEPS_AT_ONCE = 65_536, 250_000_000
 EIGHT = 8
 
@@ -47,9 +56,11 @@ class Chunk(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """How far this process is, in its share of the seeds (points times seeds in a sweep), and how fast.
+    """How far this process is, in its share of the seeds (points times seeds in a sweep), and how
+    fast.
 
-    `done` of `total` seeds; `seeds_per_second`; `real_time_factor`, simulated over real time; `left` [s].
+    `done` of `total` seeds; `seeds_per_second`; `real_time_factor`, simulated over real time;
+    `left` [s].
     """
 
     done: int
@@ -59,8 +70,10 @@ class Pace(NamedTuple):
     left: float
 
     def __str__(self) -> str:
-        return (f"{self.done} of {self.total} seeds, {self.seeds_per_second:.3g} seeds/s, "
-                f"{self.real_time_factor:.3g} x real time, {self.left:.0f} s left")  # fmt: skip
+        return (
+            f"{self.done} of {self.total} seeds, {self.seeds_per_second:.3g} seeds/s, "
+            f"{self.real_time_factor:.3g} x real time, {self.left:.0f} s left"
+        )
 
 
 class Watch(NamedTuple):
@@ -77,7 +90,8 @@ class Cut(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """An ensemble of `points` times `seeds`, cut into chunks of `together` points by `width` seeds, and its programs."""
+    """An ensemble of `points` times `seeds`, cut into chunks of `together` points by `width` seeds,
+    and its programs."""
 
     task: AbstractTask | Sweep
     key: PRNGKeyArray
@@ -108,11 +122,17 @@ class Layout(NamedTuple):
         across = math.ceil(len(self.seeds) / self.width)
         row, column = divmod(number, across)
         points = range(row * self.together, min((row + 1) * self.together, self.points))
-        return Chunk(number, points, range(column * self.width, min((column + 1) * self.width, len(self.seeds))))
+        return Chunk(
+            number,
+            points,
+            range(column * self.width, min((column + 1) * self.width, len(self.seeds))),
+        )
 
     def chunk_of(self, point: int, column: int) -> int:
         """Number of the chunk that has a point and a seed, counted from 0."""
-        return (point // self.together) * math.ceil(len(self.seeds) / self.width) + column // self.width
+        return (point // self.together) * math.ceil(
+            len(self.seeds) / self.width
+        ) + column // self.width
 
     @property
     def duration(self) -> float:
@@ -145,7 +165,8 @@ def laid_out(
     draws: Draws,
     threads: int | None,
 ) -> Layout:
-    """The layout; with `spectrum` the Welch power of every seed is computed, with `states` they are kept.
+    """The layout; with `spectrum` the Welch power of every seed is computed, with `states` they are
+    kept.
 
     `threads`: on how many cores of a CPU; None for all that this process may use.
     """
@@ -163,17 +184,27 @@ def _one_of(task: AbstractTask | Sweep) -> AbstractTask:
 
 
 def cut_of(
-    task: AbstractTask | Sweep, seeds: int, plan: Schedule, chunk: int | None, *, shared: bool, parts: int | None = None
+    task: AbstractTask | Sweep,
+    seeds: int,
+    plan: Schedule,
+    chunk: int | None,
+    *,
+    shared: bool,
+    parts: int | None = None,
 ) -> Cut:
-    """As many seeds at once as the cache of every device likes, times `BLOCKS`; whole points where their seeds are few.
+    """As many seeds at once as the cache of every device likes, times `BLOCKS`; whole points where
+    their seeds are few.
 
-    Where processes share the work, what process 0 says. Parts of a store cannot ask one another: each takes what one device
-    likes, so that machines need not be alike, or less, so that there is as much for every part.
+    Where processes share the work, what process 0 says. Parts of a store cannot ask one another:
+    each takes what one device likes, so that machines need not be alike, or less, so that there is
+    as much for every part.
     """
     if chunk is not None:
         lanes, most, parts = chunk, chunk, None
     else:
-        lanes = lanes_of(plan) * (mesh.size if parts is None and (mesh := local_mesh()) is not None else 1)
+        lanes = lanes_of(plan) * (
+            mesh.size if parts is None and (mesh := local_mesh()) is not None else 1
+        )
         lanes = int(agreed(str(lanes))) if shared else lanes
         most = lanes * BLOCKS
     points = len(task) if isinstance(task, Sweep) else 1
@@ -201,12 +232,17 @@ def covers_window(plan: Schedule, task: AbstractTask | Sweep) -> bool:
 
 def plan_of(task: AbstractTask | Sweep, *given: Any) -> Schedule:
     """The plan of a task; of a sweep with the sub-steps that its fastest point needs."""
-    plans = [schedule(each, *given) for each in ([task] if isinstance(task, AbstractTask) else task)]
+    plans = [
+        schedule(each, *given) for each in ([task] if isinstance(task, AbstractTask) else task)
+    ]
     return max(plans, key=lambda plan: plan.grid.substeps)
 
 
-def companions(task: AbstractTask | Sweep, duration: float, control: bool | None) -> tuple[LinearTask, ...] | None:
-    """The linearised task of every point, or None if they are not wanted or not all of them have a stationary response."""
+def companions(
+    task: AbstractTask | Sweep, duration: float, control: bool | None
+) -> tuple[LinearTask, ...] | None:
+    """The linearised task of every point, or None if they are not wanted or not all of them have a
+    stationary response."""
     if control is False:
         return None
     found = []
@@ -228,20 +264,34 @@ class _Ready:
         layout = self.layout
         with self.lock:
             if point != self.point:
-                arrays = as_arrays((layout.task_of(point), None if layout.linear is None else layout.linear[point]))
-                self.arrays = arrays if layout.mesh is None else eqx.filter_shard(arrays, NamedSharding(layout.mesh, P()))
+                arrays = as_arrays(
+                    (layout.task_of(point), None if layout.linear is None else layout.linear[point])
+                )
+                self.arrays = (
+                    arrays
+                    if layout.mesh is None
+                    else eqx.filter_shard(arrays, NamedSharding(layout.mesh, P()))
+                )
                 self.point = point
             return self.arrays
 
 
 def _start(layout: Layout, chunk: Chunk, ready: _Ready) -> dict[str, Any]:
-    """Dispatch a chunk, filled up with its last seed and point to its full size and equal parts for all devices."""
+    """Dispatch a chunk, filled up with its last seed and point to its full size and equal parts for
+    all devices."""
     devices = 1 if layout.mesh is None else layout.mesh.size
     single = layout.together == 1
-    width, step = layout.width, EIGHT * devices * blocks(math.ceil(layout.width / devices), layout.recipe.lanes)
+    width, step = (
+        layout.width,
+        EIGHT * devices * blocks(math.ceil(layout.width / devices), layout.recipe.lanes),
+    )
     width = step * math.ceil(width / step) if single else width
     columns = np.minimum(chunk.seeds.start + np.arange(width), chunk.seeds.stop - 1)
-    seeds = np.asarray(layout.seeds)[columns] if not isinstance(layout.seeds, range) else layout.seeds.start + columns
+    seeds = (
+        np.asarray(layout.seeds)[columns]
+        if not isinstance(layout.seeds, range)
+        else layout.seeds.start + columns
+    )
     linear = layout.linear
     if single:
         task, beside = ready.of(chunk.points.start)
@@ -250,8 +300,14 @@ def _start(layout: Layout, chunk: Chunk, ready: _Ready) -> dict[str, Any]:
     together = devices * math.ceil(layout.together / devices)
     rows = np.minimum(chunk.points.start + np.arange(together), chunk.points.stop - 1)
     tasks = jax.tree.map(lambda leaf: leaf[rows], layout.task.task)
-    beside = None if linear is None else jax.tree.map(lambda *leaves: np.stack(leaves), *[linear[i] for i in rows])
-    return run_points(as_arrays(tasks), as_arrays(beside), layout.key, seeds, layout.recipe, layout.mesh)
+    beside = (
+        None
+        if linear is None
+        else jax.tree.map(lambda *leaves: np.stack(leaves), *[linear[i] for i in rows])
+    )
+    return run_points(
+        as_arrays(tasks), as_arrays(beside), layout.key, seeds, layout.recipe, layout.mesh
+    )
 
 
 def _finish(chunk: Chunk, found: dict[str, Any]) -> Found:
@@ -263,13 +319,17 @@ def _finish(chunk: Chunk, found: dict[str, Any]) -> Found:
 
 
 def run_chunks(
-    layout: Layout, numbers: Iterable[int], tell: Callable[[Pace], None], work: Callable[[Chunk, Found], Any] | None = None
+    layout: Layout,
+    numbers: Iterable[int],
+    tell: Callable[[Pace], None],
+    work: Callable[[Chunk, Found], Any] | None = None,
 ) -> Generator[tuple[Chunk, Any], None, None]:
-    """Results of the chunks in turn, or what `work` makes of them; others are computed while the caller deals with one.
+    """Results of the chunks in turn, or what `work` makes of them; others are computed while the
+    caller deals with one.
 
-    XLA runs such a program on one core. So as many chunks run at once as there are cores, each dispatched from a thread of
-    its own (XLA works off one thread's programs one after the other). There are half as many threads more, so that no core
-    waits while the `work` is done.
+    XLA runs such a program on one core. So as many chunks run at once as there are cores, each
+    dispatched from a thread of its own (XLA works off one thread's programs one after the other).
+    There are half as many threads more, so that no core waits while the `work` is done.
     """
     chunks = [layout.chunk(number) for number in numbers]
     total = sum(len(chunk.points) * len(chunk.seeds) for chunk in chunks)
@@ -281,7 +341,10 @@ def run_chunks(
                 found = _finish(chunk, _start(layout, chunk, ready) if started is None else started)
             return found if work is None else work(chunk, found)
 
-    cores, ahead = threading.Semaphore(layout.threads), layout.threads + layout.threads // 2 if layout.threads > 1 else 1
+    cores, ahead = (
+        threading.Semaphore(layout.threads),
+        layout.threads + layout.threads // 2 if layout.threads > 1 else 1,
+    )
     pool = ThreadPoolExecutor(ahead, thread_name_prefix="jaxmuscle")
     try:
         for chunk in [*chunks, *[None] * ahead]:
@@ -300,8 +363,9 @@ def run_chunks(
 
 
 def _settings_of_this_thread() -> Callable[[], contextlib.AbstractContextManager[Any]]:
-    """JAX's precision and device may be set for one thread (`with jax.enable_x64(True)`): the same for another one."""
-    double, device = bool(jax.config.jax_enable_x64), jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    """JAX's precision and device may be set for one thread (`with jax.enable_x64(True)`): the same
+    for another one."""
+    double, device = (bool(jax.config.jax_enable_x64), jax.config.jax_default_device)  # pyright: ignore[reportAttributeAccessIssue]
 
     @contextlib.contextmanager
     def here() -> Iterator[None]:

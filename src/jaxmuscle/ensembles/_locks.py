@@ -1,4 +1,5 @@
-"""Who writes a store: one process at a time, or one for each of its parts. The system's lock on a file, and who has it."""
+"""Who writes a store: one process at a time, or one for each of its parts. The system's lock on a
+file, and who has it."""
 
 import contextlib
 import datetime
@@ -24,7 +25,8 @@ WHOLE = ""
 
 
 class Holder(NamedTuple):
-    """A process that writes: on which host, since which start of its system, its number, its start, and since when."""
+    """A process that writes: on which host, since which start of its system, its number, its start,
+    and since when."""
 
     host: str
     boot: str
@@ -52,8 +54,11 @@ class Holder(NamedTuple):
 
     @property
     def dead(self) -> bool:
-        """Whether it was a process of this host that is no more; a number that was given again is told by its start."""
-        return self.local and (self.boot != _boot() or not _runs(self.pid) or _started(self.pid) != self.started)
+        """Whether it was a process of this host that is no more; a number that was given again is
+        told by its start."""
+        return self.local and (
+            self.boot != _boot() or not _runs(self.pid) or _started(self.pid) != self.started
+        )
 
     @property
     def local(self) -> bool:
@@ -62,7 +67,8 @@ class Holder(NamedTuple):
 
     @property
     def near(self) -> bool:
-        """Whether it is of this machine, perhaps in another container, so that the system knows of its locks."""
+        """Whether it is of this machine, perhaps in another container, so that the system knows of
+        its locks."""
         return self.local or (self.boot != "" and self.boot == _boot())
 
     def __str__(self) -> str:
@@ -97,26 +103,38 @@ def _runs(pid: int) -> bool:
 
 def busy(store: str, who: object) -> StoreError:
     """Another process writes."""
-    return StoreError(f"{store}: {who} is writing it: wait until that has ended, or end it, then repeat this command")
+    return StoreError(
+        f"{store}: {who} is writing it: wait until that has ended, or end it, then repeat this"
+        " command"
+    )
 
 
 def left(store: str, who: Holder, remedy: str) -> StoreError:
     """A lock of another host, from where nobody can tell whether its process lives."""
-    return StoreError(f"{store}: {who} has a lock on it and may still write. If it has ended, {remedy}, then repeat this")
+    return StoreError(
+        f"{store}: {who} has a lock on it and may still write. If it has ended, {remedy}, then"
+        " repeat this"
+    )
 
 
 def taken_over(store: str, who: Holder) -> None:
     """Say that a lock was left."""
-    LOG.warning("notice: %s: %s has ended without removing its lock. It is taken over; what was complete stays", store, who)
+    LOG.warning(
+        "notice: %s: %s has ended without removing its lock. It is taken over; what was complete"
+        " stays",
+        store,
+        who,
+    )
 
 
 @contextlib.contextmanager
 def locked(store: Path, name: str, role: str) -> Iterator[None]:
     """Be the writer of the store in a folder.
 
-    `role` is `WHOLE`, for a process that nobody may write beside; "part-3", for one beside which other parts write; or
-    "process-2", for one of a distributed run whose process 0 has the whole. The lock is the system's, on a hidden file
-    beside the store, and goes with the process. The file says who has it, and goes with the lock.
+    `role` is `WHOLE`, for a process that nobody may write beside; "part-3", for one beside which
+    other parts write; or "process-2", for one of a distributed run whose process 0 has the whole.
+    The lock is the system's, on a hidden file beside the store, and goes with the process. The file
+    says who has it, and goes with the lock.
 
     **Raises:** `StoreError` that says who writes, and what to do.
     """
@@ -136,10 +154,14 @@ def _beside(whole: Path) -> list[Path]:
 
 
 @contextlib.contextmanager
-def _held(file: Path, name: str, *, shared: bool = False, beside: bool = False, patient: bool = False) -> Iterator[None]:
-    """Hold one lock, for this process alone or `shared`; with `beside` nobody else may hold one of a part or process.
+def _held(
+    file: Path, name: str, *, shared: bool = False, beside: bool = False, patient: bool = False
+) -> Iterator[None]:
+    """Hold one lock, for this process alone or `shared`; with `beside` nobody else may hold one of
+    a part or process.
 
-    With `patient`, a lock that was left on another host is taken over, too: a part that runs twice does no harm.
+    With `patient`, a lock that was left on another host is taken over, too: a part that runs twice
+    does no harm.
     """
     handle = _taken(file, name, shared=shared, patient=patient)
     try:
@@ -148,7 +170,8 @@ def _held(file: Path, name: str, *, shared: bool = False, beside: bool = False, 
                 pass
         yield
     finally:
-        # The last of those who share removes the file; whoever opened it meanwhile sees that, and begins again.
+        # The last of those who share removes the file; whoever opened it meanwhile sees that, and
+        # begins again.
         last = not shared or _lock(handle, shared=False)
         if sys.platform == "win32":  # which removes no open file
             os.close(handle)
@@ -163,7 +186,9 @@ def _taken(file: Path, name: str, *, shared: bool, patient: bool) -> int:
         handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             got, who = _lock(handle, shared=shared), Holder.of(os.read(handle, 4096))
-            who_else = who or next(filter(None, (Holder.of(_bytes(other)) for other in _beside(file))), None)
+            who_else = who or next(
+                filter(None, (Holder.of(_bytes(other)) for other in _beside(file))), None
+            )
             if got is False and who_else is not None:
                 raise busy(name, who_else)
             if got is not False and _is(handle, file):
@@ -177,13 +202,27 @@ def _taken(file: Path, name: str, *, shared: bool, patient: bool) -> int:
     raise busy(name, "another process")
 
 
-def _succeed(handle: int, file: Path, name: str, who: Holder | None, *, known: bool, shared: bool, patient: bool) -> None:
+def _succeed(
+    handle: int,
+    file: Path,
+    name: str,
+    who: Holder | None,
+    *,
+    known: bool,
+    shared: bool,
+    patient: bool,
+) -> None:
     """Follow who held the lock before, if that is sure to have ended."""
     if not known:
-        LOG.warning("notice: %s: this file system has no locks. See to it that no other process writes", name)
+        LOG.warning(
+            "notice: %s: this file system has no locks. See to it that no other process writes",
+            name,
+        )
     if who is not None:
         if not (who.near if known else who.dead) and not patient:
-            raise busy(name, who) if who.local else left(name, who, f"remove the lock (rm '{file}')")
+            raise (
+                busy(name, who) if who.local else left(name, who, f"remove the lock (rm '{file}')")
+            )
         taken_over(name, who)
     os.ftruncate(handle, 0)
     if not shared:

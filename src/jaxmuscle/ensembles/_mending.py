@@ -25,7 +25,8 @@ def drop_damaged(place: AbstractPlace, chunks: Iterable[int]) -> None:
 
 
 def mend(place: AbstractPlace, known: Mapping[str, np.ndarray]) -> list[str]:
-    """Write again what is damaged of the descriptions of single arrays, and of arrays whose values are known.
+    """Write again what is damaged of the descriptions of single arrays, and of arrays whose values
+    are known.
 
     **Returns:** the keys of what else is damaged or missing, if the store is complete.
     """
@@ -37,14 +38,21 @@ def mend(place: AbstractPlace, known: Mapping[str, np.ndarray]) -> list[str]:
         LOG.warning("notice: %s: %s: written again", place.name, in_words(mended))
         names = {key: key.split("/")[0] for key in mended}
         with writing(place):
-            place.write({key: text_of(described(document)[name]) for key, name in names.items() if key.endswith(ROOT)})
+            place.write(
+                {
+                    key: text_of(described(document)[name])
+                    for key, name in names.items()
+                    if key.endswith(ROOT)
+                }
+            )
             place.remove(*(key for key in mended if not key.endswith(ROOT)))
         write_arrays(place, {name: known[name] for name in names.values() if name in known})
     return lost
 
 
 def reopen(place: AbstractPlace, layout: Layout, lost: list[str], failed: list[list[int]]) -> None:
-    """Make a complete store, of which these keys are lost, one to be resumed: all other chunks are done.
+    """Make a complete store, of which these keys are lost, one to be resumed: all other chunks are
+    done.
 
     Of a reduced store none is, since what is reduced cannot be taken apart.
     """
@@ -52,7 +60,9 @@ def reopen(place: AbstractPlace, layout: Layout, lost: list[str], failed: list[l
     document = description_of(place)
     chunks = {chunk_of_key(document, key) for key in lost}
     if None not in chunks:
-        done: dict[int, list[list[int]]] = {number: [] for number in range(layout.chunks) if number not in chunks}
+        done: dict[int, list[list[int]]] = {
+            number: [] for number in range(layout.chunks) if number not in chunks
+        }
         columns = {int(seed): column for column, seed in enumerate(layout.seeds)}
         for point, seed in failed:
             done.get(layout.chunk_of(point, columns[seed]), []).append([point, seed])

@@ -29,7 +29,8 @@ def opened(
     begin: Begin,
     part: Part | None,
 ) -> Iterator[bool]:
-    """Make or find the store, as process 0 sees it; whether there is work left. All processes raise the same error.
+    """Make or find the store, as process 0 sees it; whether there is work left. All processes raise
+    the same error.
 
     As long as there is, nobody else may write it, but other parts beside a part.
     """
@@ -37,7 +38,9 @@ def opened(
     with contextlib.ExitStack() as locks:
         if rank == 0:
             try:
-                said = _begun(locks, layout, place, variables, coordinates, attributes, begin=begin, part=part)
+                said = _begun(
+                    locks, layout, place, variables, coordinates, attributes, begin=begin, part=part
+                )
             except (ValueError, OSError) as error:
                 said, failure = f"error: {error}", error
         said = agreed(said)
@@ -46,8 +49,10 @@ def opened(
         if said.startswith("error: "):
             raise StoreError(said.removeprefix("error: "))
         if not place.exists():
-            raise StoreError(f"{place.name}: process {rank} does not see what process 0 made: give a folder that all "
-                             "processes share")  # fmt: skip
+            raise StoreError(
+                f"{place.name}: process {rank} does not see what process 0 made: give a folder that"
+                " all processes share"
+            )
         if rank > 0 and said != "complete":
             locks.enter_context(place.locked(f"process-{rank}"))
         yield said != "complete"
@@ -66,7 +71,9 @@ def _begun(
 ) -> str:
     """Whether the store is "begun", with its lock among `locks`, or "complete" and intact."""
     said = state_of(place, attributes, begin=begin)
-    if said == "complete" and (part is not None or not (wrong(place, description_of(place)) or place.progress())):
+    if said == "complete" and (
+        part is not None or not (wrong(place, description_of(place)) or place.progress())
+    ):
         return said
     with writing(place):
         locks.enter_context(place.locked(WHOLE if part is None else f"part-{part.number}"))
@@ -78,7 +85,9 @@ def _begun(
         return "begun"
     if said == "absent":  # another part was faster
         said = state_of(place, attributes, begin="new" if part is None else "part")
-    known: dict[str, np.ndarray] = {name: v.values for name, v in variables.items() if v.values is not None}
+    known: dict[str, np.ndarray] = {
+        name: v.values for name, v in variables.items() if v.values is not None
+    }
     lost = mend(place, known)
     if said == "complete" and not lost:
         with writing(place):

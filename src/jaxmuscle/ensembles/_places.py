@@ -29,7 +29,8 @@ TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
 
 
 class AbstractPlace(eqx.Module):
-    """Where a store lies. Its keys, such as `progress/a.json`, hold bytes; every key is written whole or not at all."""
+    """Where a store lies. Its keys, such as `progress/a.json`, hold bytes; every key is written
+    whole or not at all."""
 
     name: eqx.AbstractVar[str]
 
@@ -63,7 +64,8 @@ class AbstractPlace(eqx.Module):
 
     @abstractmethod
     def forget(self) -> None:
-        """Remove all keys below `progress/`, and what processes that were killed left here. For the only writer."""
+        """Remove all keys below `progress/`, and what processes that were killed left here. For the
+        only writer."""
 
     @abstractmethod
     def locked(self, role: str) -> contextlib.AbstractContextManager[None]:
@@ -129,7 +131,11 @@ class Folder(AbstractPlace):
         return itertools.takewhile(lambda folder: folder != self.path.parent, file.parents)
 
     def progress(self) -> list[str]:
-        return sorted(f"{PROGRESS}/{file.name}" for file in (self.path / PROGRESS).glob("*") if file.suffix != UNFINISHED)
+        return sorted(
+            f"{PROGRESS}/{file.name}"
+            for file in (self.path / PROGRESS).glob("*")
+            if file.suffix != UNFINISHED
+        )
 
     def remove(self, *keys: str) -> None:
         for key in keys:
@@ -183,7 +189,8 @@ class Folder(AbstractPlace):
 class Bucket(AbstractPlace):
     """A prefix in an object store, which has no renaming: the root key of a store is written last.
 
-    Who begins says the settings first, in a key that is created once only where the object store can do that.
+    Who begins says the settings first, in a key that is created once only where the object store
+    can do that.
     """
 
     name: str
@@ -198,12 +205,17 @@ class Bucket(AbstractPlace):
     def exists(self) -> bool:
         try:
             self.files.invalidate_cache()
-            # In this order: others may begin meanwhile, with the claim, or complete, with the root before the claim goes.
-            anything, claim, root = (self.files.exists(path) for path in (self.path, self._full(CLAIM), self._full(ROOT)))
+            # In this order: others may begin meanwhile, with the claim, or complete, with the root
+            # before the claim goes.
+            anything, claim, root = (
+                self.files.exists(path) for path in (self.path, self._full(CLAIM), self._full(ROOT))
+            )
             return root or (anything and not claim)
         except Exception as error:  # every object store fails in its own way
-            raise StoreError(f"{self.name}: cannot be reached ({type(error).__name__}: {error}); check the URL, the network "
-                             "and the credentials") from error  # fmt: skip
+            raise StoreError(
+                f"{self.name}: cannot be reached ({type(error).__name__}: {error}); check the URL,"
+                " the network and the credentials"
+            ) from error
 
     def read(self, key: str) -> bytes | None:
         return self._cat(self._full(key))
@@ -245,7 +257,9 @@ class Bucket(AbstractPlace):
         return _temporary()
 
     def put(self, built: Path) -> bool:
-        for file in sorted(file for file in built.rglob("*") if file.is_file() and file != built / ROOT):
+        for file in sorted(
+            file for file in built.rglob("*") if file.is_file() and file != built / ROOT
+        ):
             self.write({file.relative_to(built).as_posix(): file.read_bytes()})
         return self._create(self._full(ROOT), (built / ROOT).read_bytes())
 
@@ -255,7 +269,8 @@ class Bucket(AbstractPlace):
 
     @contextlib.contextmanager
     def locked(self, role: str) -> Iterator[None]:
-        """A key beside the store says who writes. Without the system's help, a lock that was left is told by its process."""
+        """A key beside the store says who writes. Without the system's help, a lock that was left
+        is told by its process."""
         folder = f"{self.path.rstrip('/')}.lock"
         name = role or "whole"
         mine, holder = f"{folder}/{name}", Holder.here().to_bytes()
@@ -277,7 +292,11 @@ class Bucket(AbstractPlace):
         if who is None:
             return
         if not who.dead and not (patient and not who.local):
-            raise busy(self.name, who) if who.local else left(self.name, who, f"remove the key {lock}")
+            raise (
+                busy(self.name, who)
+                if who.local
+                else left(self.name, who, f"remove the key {lock}")
+            )
         taken_over(self.name, who)
         self._drop(lock)
 
@@ -319,8 +338,11 @@ def place_of(path: str | Path) -> AbstractPlace:
     except ImportError as error:
         raise StoreError(f"{text}: a URL needs fsspec: pip install fsspec") from error
     try:
-        # fsspec's own local files, with which tests play an object store, make no folders unless they are told to.
-        files, inside = url_to_fs(text, **({"auto_mkdir": True} if text.startswith("local://") else {}))
+        # fsspec's own local files, with which tests play an object store, make no folders unless
+        # they are told to.
+        files, inside = url_to_fs(
+            text, **({"auto_mkdir": True} if text.startswith("local://") else {})
+        )
     except (ImportError, ValueError) as error:
         raise StoreError(f"{text}: {error}") from error
     return Bucket(text, files, inside)

@@ -1,4 +1,5 @@
-"""Several processes, on one machine or many, that share the work on one store: JAX's distributed runtime."""
+"""Several processes, on one machine or many, that share the work on one store: JAX's distributed
+runtime."""
 
 import atexit
 import contextlib
@@ -21,7 +22,8 @@ PATIENCE = 10.0
 
 
 def join(coordinator: str | None, processes: int | None, process_id: int | None) -> None:
-    """Become one of several processes; with None for all arguments as the launcher says (SLURM, Open MPI, ...).
+    """Become one of several processes; with None for all arguments as the launcher says (SLURM,
+    Open MPI, ...).
 
     **Arguments:**
 
@@ -33,22 +35,30 @@ def join(coordinator: str | None, processes: int | None, process_id: int | None)
     """
     given = (coordinator, processes, process_id)
     if any(g is None for g in given) and any(g is not None for g in given):
-        raise ValueError("--coordinator, --processes and --process-id belong together: give all three, or none of them "
-                         "under a launcher that JAX knows (SLURM, Open MPI)")  # fmt: skip
+        raise ValueError(
+            "--coordinator, --processes and --process-id belong together: give all three, or none"
+            " of them under a launcher that JAX knows (SLURM, Open MPI)"
+        )
     if processes is not None and process_id is not None and not 0 <= process_id < processes:
-        raise ValueError(f"--process-id = {process_id} must be from 0 to --processes - 1 = {processes - 1}")
+        raise ValueError(
+            f"--process-id = {process_id} must be from 0 to --processes - 1 = {processes - 1}"
+        )
     try:
         jax.distributed.initialize(coordinator, processes, process_id)
     except (RuntimeError, ValueError) as error:
-        raise ValueError(f"the processes did not find each other at {coordinator}: {error}") from None
+        raise ValueError(
+            f"the processes did not find each other at {coordinator}: {error}"
+        ) from None
     if (handler := signal.getsignal(signal.SIGTERM)) is not None:
-        signal.signal(signal.SIGTERM, handler)  # JAX has put one of its own there, which only takes a note
+        # JAX has put one of its own there, which only takes a note
+        signal.signal(signal.SIGTERM, handler)
     if coordinator is not None and process_id:
         _follow(coordinator)
 
 
 def _follow(coordinator: str) -> None:
-    """End this process in one sentence once process 0 has died: XLA would end it with a stack of C++."""
+    """End this process in one sentence once process 0 has died: XLA would end it with a stack of
+    C++."""
     host, _, port = coordinator.rpartition(":")
     ended = threading.Event()
     atexit.register(ended.set)  # before JAX says goodbye to process 0
@@ -64,8 +74,11 @@ def _follow(coordinator: str) -> None:
             except OSError:
                 break
         if not ended.is_set():
-            os.write(2, b"failed: process 0 of this run died or stopped. What is complete stays: start all processes again "
-                        b"with --resume\n")  # fmt: skip
+            os.write(
+                2,
+                b"failed: process 0 of this run died or stopped. What is complete stays: start all"
+                b" processes again with --resume\n",
+            )
             os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
@@ -92,7 +105,9 @@ def agreed(text: str) -> str:
     try:
         heard = multihost_utils.broadcast_one_to_all(said)
     except Exception as error:
-        raise ProcessLostError(f"another process of this run died or stopped ({_first_line(error)})") from error
+        raise ProcessLostError(
+            f"another process of this run died or stopped ({_first_line(error)})"
+        ) from error
     return bytes(np.asarray(heard).astype(np.uint8)).rstrip(b"\0").decode(errors="replace")
 
 
@@ -106,9 +121,11 @@ def _first_line(error: Exception) -> str:
 
 
 def leave(code: int) -> NoReturn:
-    """End this process with the exit `code`: JAX's own end would wait for processes that will not come.
+    """End this process with the exit `code`: JAX's own end would wait for processes that will not
+    come.
 
-    Process 0 waits two seconds before it ends: the others end when it does, and have messages to print.
+    Process 0 waits two seconds before it ends: the others end when it does, and have messages to
+    print.
     """
     if jax.process_count() > 1 and jax.process_index() == 0:
         time.sleep(LAST_WORDS)

@@ -1,4 +1,5 @@
-"""Ensembles that outlive their process: reduced while they run, or streamed to a store, by one process or many."""
+"""Ensembles that outlive their process: reduced while they run, or streamed to a store, by one
+process or many."""
 
 import contextlib
 import time
@@ -18,11 +19,28 @@ from ._opening import opened
 from ._parts import Part, PartReport, failed_in, finish
 from ._places import AbstractPlace
 from ._processes import meet, rank_and_count
-from ._running_moments import CELLS, ChunkMoments, RunningMoments, add, count_cells, empty, moments, set_cells
+from ._running_moments import (
+    CELLS,
+    ChunkMoments,
+    RunningMoments,
+    add,
+    count_cells,
+    empty,
+    moments,
+    set_cells,
+)
 from ._settings import about, identity
 from ._store import PARTS, Begin, Variable, chunk_log, ensemble_at, logged, write_region
 from ._summary import EnsembleSummary, summarised
-from ._tallies import Reduced, generation_of, read_tallies, read_tally, tally_key, tally_keys, write_tally
+from ._tallies import (
+    Reduced,
+    generation_of,
+    read_tallies,
+    read_tally,
+    tally_key,
+    tally_keys,
+    write_tally,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -43,7 +61,8 @@ def reduced(
     begin: Begin = "new",
     part: Part | None = None,
 ) -> EnsembleSummary | PartReport:
-    """Moments, quantiles and the mean spectrum of all chunks; kept in a store from time to time if there is one.
+    """Moments, quantiles and the mean spectrum of all chunks; kept in a store from time to time if
+    there is one.
 
     Of one part its chunks only, whose tally stays in the store until it is merged.
     """
@@ -59,12 +78,22 @@ def reduced(
         found = _reduce(layout, levels, nothing(), range(layout.chunks), tell, lambda found: None)
         return _summary(layout, levels, found)
     known = {*blank.coordinates(), "power_expected"}
-    variables = {name: Variable(dims, array.shape, array.shape, array.dtype, units, array if name in known else None)
-                 for name, (dims, array, units) in blank.arrays().items()}  # fmt: skip
+    variables = {
+        name: Variable(
+            dims, array.shape, array.shape, array.dtype, units, array if name in known else None
+        )
+        for name, (dims, array, units) in blank.arrays().items()
+    }
     attributes = blank.attributes() | identified
-    with opened(layout, place, variables, blank.coordinates(), attributes, begin=begin, part=part) as left:
+    with opened(
+        layout, place, variables, blank.coordinates(), attributes, begin=begin, part=part
+    ) as left:
         if part is not None:
-            failed = _reduce_part(layout, levels, place, part, tell, nothing) if left else failed_in(place)
+            failed = (
+                _reduce_part(layout, levels, place, part, tell, nothing)
+                if left
+                else failed_in(place)
+            )
             return _report(layout, part, failed, complete=not left)
         if left:
             _reduce_all(layout, levels, place, tell, nothing)
@@ -80,9 +109,14 @@ def _finished(layout: Layout, place: AbstractPlace) -> None:
 
 
 def _reduce_all(
-    layout: Layout, levels: tuple[float, ...], place: AbstractPlace, tell: Tell, nothing: Callable[[], Reduced]
+    layout: Layout,
+    levels: tuple[float, ...],
+    place: AbstractPlace,
+    tell: Tell,
+    nothing: Callable[[], Reduced],
 ) -> None:
-    """All that is left; of a store made in parts, which was damaged, part by part, so that the numbers are the same."""
+    """All that is left; of a store made in parts, which was damaged, part by part, so that the
+    numbers are the same."""
     parts = ensemble_at(place).get(PARTS)
     if parts is None:
         return _share_tallies(layout, levels, place, tell, nothing)
@@ -93,9 +127,14 @@ def _reduce_all(
 
 
 def _share_tallies(
-    layout: Layout, levels: tuple[float, ...], place: AbstractPlace, tell: Tell, nothing: Callable[[], Reduced]
+    layout: Layout,
+    levels: tuple[float, ...],
+    place: AbstractPlace,
+    tell: Tell,
+    nothing: Callable[[], Reduced],
 ) -> None:
-    """Every process reduces its share of what no tally in the store has yet; process 0 takes over those there are."""
+    """Every process reduces its share of what no tally in the store has yet; process 0 takes over
+    those there are."""
     rank, count = rank_and_count()
     base, old = read_tallies(place) or nothing(), tally_keys(place)
     todo = [n for n in range(layout.chunks) if n not in base.chunks][rank::count]
@@ -105,29 +144,48 @@ def _share_tallies(
         write_tally(place, key, base)
         place.remove(*old)
     found = _reduce(
-        layout, levels, base if rank == 0 else nothing(), todo, tell, lambda found: write_tally(place, key, found)
+        layout,
+        levels,
+        base if rank == 0 else nothing(),
+        todo,
+        tell,
+        lambda found: write_tally(place, key, found),
     )
     write_tally(place, key, found)
     meet()
 
 
 def _reduce_part(
-    layout: Layout, levels: tuple[float, ...], place: AbstractPlace, part: Part, tell: Tell, nothing: Callable[[], Reduced]
+    layout: Layout,
+    levels: tuple[float, ...],
+    place: AbstractPlace,
+    part: Part,
+    tell: Tell,
+    nothing: Callable[[], Reduced],
 ) -> list[list[int]]:
-    """One part goes on with its own tally, and no other process writes that; the (point, seed) that failed."""
+    """One part goes on with its own tally, and no other process writes that; the (point, seed) that
+    failed."""
     key = tally_key(0, part.number)
     base = read_tally(place, key) or nothing()
     todo = [n for n in part.chunks(layout.chunks) if n not in base.chunks]
     if todo:
-        base = _reduce(layout, levels, base, todo, tell, lambda found: write_tally(place, key, found))
+        base = _reduce(
+            layout, levels, base, todo, tell, lambda found: write_tally(place, key, found)
+        )
         write_tally(place, key, base)
     return base.failed
 
 
 def _reduce(
-    layout: Layout, levels: tuple[float, ...], found: Reduced, numbers: Any, tell: Tell, save: Callable[[Reduced], None]
+    layout: Layout,
+    levels: tuple[float, ...],
+    found: Reduced,
+    numbers: Any,
+    tell: Tell,
+    save: Callable[[Reduced], None],
 ) -> Reduced:
-    """Chunks into a tally, which starts as `found`; saved from time to time, and when interrupted."""
+    """Chunks into a tally, which starts as `found`; saved from time to time, and when
+    interrupted."""
     tally, chunks, failed = found.tally, set(found.chunks), list(found.failed)
     known = np.flatnonzero(~np.isnan(tally.low).any(axis=1))
     edges: dict[int, Edges] = {int(point): (tally.low[point], tally.high[point]) for point in known}
@@ -135,7 +193,10 @@ def _reduce(
 
     def condensed(chunk: Chunk, result: dict[str, np.ndarray]) -> Condensed:
         """On the thread that has simulated the chunk."""
-        each = [_moments(layout, levels, result, row, edges.get(point)) for row, point in enumerate(chunk.points)]
+        each = [
+            _moments(layout, levels, result, row, edges.get(point))
+            for row, point in enumerate(chunk.points)
+        ]
         return Condensed(each, _failed(layout, chunk, result), result["output"], result["finite"])
 
     try:
@@ -157,7 +218,9 @@ def _reduce(
 Edges = tuple[np.ndarray, np.ndarray]
 
 
-def _add_chunk(layout: Layout, tally: RunningMoments, edges: dict[int, Edges], chunk: Chunk, more: "Condensed") -> None:
+def _add_chunk(
+    layout: Layout, tally: RunningMoments, edges: dict[int, Edges], chunk: Chunk, more: "Condensed"
+) -> None:
     """One chunk into the tally. The first one of a point says where the cells of the point lie."""
     for row, point in enumerate(chunk.points):
         part = more.moments[row]
@@ -171,8 +234,8 @@ def _add_chunk(layout: Layout, tally: RunningMoments, edges: dict[int, Edges], c
 
 
 class Condensed(NamedTuple):
-    """What is left of a chunk: moments of every point, (point, seed) of what failed, and the output, whose cells may have
-    to be counted yet."""
+    """What is left of a chunk: moments of every point, (point, seed) of what failed, and the
+    output, whose cells may have to be counted yet."""
 
     moments: list[ChunkMoments]
     failed: list[list[int]]
@@ -199,28 +262,37 @@ def _moments(
 
 def _failed(layout: Layout, chunk: Chunk, found: dict[str, np.ndarray]) -> list[list[int]]:
     """Point and seed of what did not stay finite."""
-    return [[chunk.points[i], int(layout.seeds[chunk.seeds[j]])] for i, j in np.argwhere(~found["finite"])]
+    return [
+        [chunk.points[i], int(layout.seeds[chunk.seeds[j]])]
+        for i, j in np.argwhere(~found["finite"])
+    ]
 
 
 def _cell_sample(layout: Layout, chunk: Chunk, point: int, output: np.ndarray) -> np.ndarray:
     """Output of the first chunk of a point, by which every process places its cells."""
     first = layout.chunk_of(point, 0)
     if chunk.number != first:
-        (_, found), = run_chunks(layout, [first], lambda pace: None)  # fmt: skip
+        ((_, found),) = run_chunks(layout, [first], lambda pace: None)
         output = found["output"][0][found["finite"][0]]
     if len(output) == 0:
-        raise SimulationError(f"none of the first seeds of point {point} stayed finite: lower the noise amplitude or dt")
+        raise SimulationError(
+            f"none of the first seeds of point {point} stayed finite: lower the noise amplitude"
+            " or dt"
+        )
     return output
 
 
 def _rows(layout: Layout, found: dict[str, np.ndarray], row: int) -> np.ndarray:
-    """The values of every seed that are averaged: output, Welch power, what the linear response leaves of it, variation."""
+    """The values of every seed that are averaged: output, Welch power, what the linear response
+    leaves of it, variation."""
     output = found["output"][row]
     if not layout.bins:
         return output.astype(float)
     power = found["power"][row]
     left = power - found["linear_power"][row] if layout.linear is not None else np.zeros_like(power)
-    return np.concatenate([output, power, left, found["variation"][row][:, None]], axis=1, dtype=float)
+    return np.concatenate(
+        [output, power, left, found["variation"][row][:, None]], axis=1, dtype=float
+    )
 
 
 def _keeper(save: Callable[[Reduced], None]) -> Callable[[Reduced], None]:
@@ -239,9 +311,16 @@ def _keeper(save: Callable[[Reduced], None]) -> Callable[[Reduced], None]:
 
 
 def stored(
-    layout: Layout, place: AbstractPlace, tell: Tell, *, begin: Begin, states: bool, part: Part | None
+    layout: Layout,
+    place: AbstractPlace,
+    tell: Tell,
+    *,
+    begin: Begin,
+    states: bool,
+    part: Part | None,
 ) -> "xarray.Dataset | PartReport":
-    """Every trajectory, and its Welch power, to a store; opened when it is complete. Of one part its chunks only."""
+    """Every trajectory, and its Welch power, to a store; opened when it is complete. Of one part
+    its chunks only."""
     import xarray
 
     attributes = about(layout) | identity(layout, part, {"kind": "trajectories", "states": states})
@@ -252,15 +331,22 @@ def stored(
             _write_chunks(layout, place, own, tell, states=states)
         if part is not None:
             there = logged(place, own)
-            failed = [entry for number in sorted(there) for entry in there[number]] if left else failed_in(place)
+            failed = (
+                [entry for number in sorted(there) for entry in there[number]]
+                if left
+                else failed_in(place)
+            )
             return _report(layout, part, failed, complete=not left)
         if left:
             _finished(layout, place)
     return xarray.open_zarr(place.opened())
 
 
-def _write_chunks(layout: Layout, place: AbstractPlace, own: range, tell: Tell, *, states: bool) -> None:
-    """Every process writes its share of those of these chunks that are not there, or are damaged."""
+def _write_chunks(
+    layout: Layout, place: AbstractPlace, own: range, tell: Tell, *, states: bool
+) -> None:
+    """Every process writes its share of those of these chunks that are not there, or are
+    damaged."""
     rank, count = rank_and_count()
     drop_damaged(place, logged(place, own[rank::count]))
     meet()
@@ -284,12 +370,23 @@ def _report(layout: Layout, part: Part, failed: list[list[int]], *, complete: bo
 def _summary(layout: Layout, levels: tuple[float, ...], found: Reduced) -> EnsembleSummary:
     expected = None
     if layout.bins and layout.linear is not None:
-        spectra = [linear_spectrum(layout.task_of(i), layout.recipe.settings) for i in range(layout.points)]
+        spectra = [
+            linear_spectrum(layout.task_of(i), layout.recipe.settings) for i in range(layout.points)
+        ]
         expected = np.stack([np.asarray(spectrum.power, float) for spectrum in spectra])
     failed: Int[np.ndarray, "failed 2"] = np.array(sorted(found.failed), int).reshape(-1, 2)
     described = about(layout) | ({} if layout.whole else {"cells_per_quantile": CELLS})
-    return summarised(found.tally, layout.task, len(layout.seeds), layout.time, levels, layout.recipe.settings, expected,
-                      failed, described)  # fmt: skip
+    return summarised(
+        found.tally,
+        layout.task,
+        len(layout.seeds),
+        layout.time,
+        levels,
+        layout.recipe.settings,
+        expected,
+        failed,
+        described,
+    )
 
 
 def _loaded(place: AbstractPlace, blank: EnsembleSummary) -> EnsembleSummary:
@@ -298,4 +395,6 @@ def _loaded(place: AbstractPlace, blank: EnsembleSummary) -> EnsembleSummary:
 
     group: Any = zarr.open_group(place.opened(), mode="r")
     failed = np.array(failed_in(place), int).reshape(-1, 2)
-    return blank.with_arrays({name: np.asarray(group[name][...]) for name in blank.arrays()}, failed)
+    return blank.with_arrays(
+        {name: np.asarray(group[name][...]) for name in blank.arrays()}, failed
+    )

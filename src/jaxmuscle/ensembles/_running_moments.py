@@ -1,4 +1,5 @@
-"""Moments and quantiles of an ensemble that never is in memory: tallies of chunks, which merge in any order."""
+"""Moments and quantiles of an ensemble that never is in memory: tallies of chunks, which merge in
+any order."""
 
 from typing import NamedTuple
 
@@ -14,10 +15,11 @@ REACH = 8.0  # standard deviations of the first chunk
 class RunningMoments(NamedTuple):
     """What is known of every point of a sweep (a leading axis, 1 long for one task).
 
-    `seeds` that were finite; `mean` and `squares` (sums of squared deviations) of the values of a seed in a row: its output
-    over time, then what else is averaged. Quantiles of the output are `exact` where all seeds of a point came together;
-    else its values are counted in `cells` between `low` and `high` of every sample (the outermost ones open), and NaN where
-    no chunk of the point was seen.
+    `seeds` that were finite; `mean` and `squares` (sums of squared deviations) of the values of a
+    seed in a row: its output over time, then what else is averaged. Quantiles of the output are
+    `exact` where all seeds of a point came together; else its values are counted in `cells` between
+    `low` and `high` of every sample (the outermost ones open), and NaN where no chunk of the point
+    was seen.
     """
 
     seeds: Int[np.ndarray, " points"]
@@ -30,17 +32,25 @@ class RunningMoments(NamedTuple):
 
 
 def empty(points: int, values: int, samples: int, levels: int, *, whole: bool) -> RunningMoments:
-    """Of nothing; `whole` if every point comes in one piece, so that nothing has to be counted in cells."""
+    """Of nothing; `whole` if every point comes in one piece, so that nothing has to be counted in
+    cells."""
     rows, cells = np.zeros((points, values)), 0 if whole else CELLS
     unknown = np.full((points, samples), np.nan)
     exact = np.full((points, levels, samples), np.nan)
-    return RunningMoments(np.zeros(points, int), rows, rows.copy(), exact, unknown, unknown.copy(),
-                 np.zeros((points, samples, cells), np.int32))  # fmt: skip
+    return RunningMoments(
+        np.zeros(points, int),
+        rows,
+        rows.copy(),
+        exact,
+        unknown,
+        unknown.copy(),
+        np.zeros((points, samples, cells), np.int32),
+    )
 
 
 class ChunkMoments(NamedTuple):
-    """What a chunk adds to one point: finite `seeds`, `mean` and `squares` of their values, `cells` of their output, and
-    its `exact` quantiles where all seeds of the point came together."""
+    """What a chunk adds to one point: finite `seeds`, `mean` and `squares` of their values, `cells`
+    of their output, and its `exact` quantiles where all seeds of the point came together."""
 
     seeds: int
     mean: Float[np.ndarray, " values"]
@@ -61,7 +71,10 @@ def moments(rows: Float[np.ndarray, "seeds values"]) -> ChunkMoments:
 def add(kept: RunningMoments, point: int, more: ChunkMoments) -> None:
     """Take a chunk of one point into what is kept, in place."""
     if more.seeds:
-        found = _merged((kept.seeds[point], kept.mean[point], kept.squares[point]), (more.seeds, more.mean, more.squares))
+        found = _merged(
+            (kept.seeds[point], kept.mean[point], kept.squares[point]),
+            (more.seeds, more.mean, more.squares),
+        )
         kept.seeds[point], kept.mean[point], kept.squares[point] = found
         if more.exact is not None:
             kept.exact[point] = more.exact
@@ -70,7 +83,8 @@ def add(kept: RunningMoments, point: int, more: ChunkMoments) -> None:
 
 
 def _merged(a: tuple, b: tuple) -> tuple:
-    """Moments of two sets together (Chan, Golub & LeVeque 1983, doi:10.1080/00031305.1983.10483115)."""
+    """Moments of two sets together (Chan, Golub & LeVeque 1983,
+    doi:10.1080/00031305.1983.10483115)."""
     count = a[0] + b[0]
     share = b[0] / np.maximum(count, 1)
     delta = b[1] - a[1]
@@ -80,15 +94,19 @@ def _merged(a: tuple, b: tuple) -> tuple:
 def set_cells(kept: RunningMoments, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
     """Where the cells of a point lie, from the output of its first chunk."""
     mean, sd = output.mean(axis=0, dtype=float), output.std(axis=0, dtype=float)
-    tiny = 1e-6 * np.abs(mean) + 1e3 * np.finfo(output.dtype).tiny  # what does not vary has its value for a quantile
+    # what does not vary has its value for a quantile
+    tiny = 1e-6 * np.abs(mean) + 1e3 * np.finfo(output.dtype).tiny
     reach = np.maximum(REACH * sd, 2 * np.abs(output - mean).max(axis=0)) + tiny
     kept.low[point], kept.high[point] = mean - reach, mean + reach
 
 
 def count_cells(
-    low: Float[np.ndarray, " samples"], high: Float[np.ndarray, " samples"], output: Float[np.ndarray, "seeds samples"]
+    low: Float[np.ndarray, " samples"],
+    high: Float[np.ndarray, " samples"],
+    output: Float[np.ndarray, "seeds samples"],
 ) -> Int[np.ndarray, "samples cells"]:
-    """How much of the output of a chunk lies in each cell of its point; few seeds at a time, which stay in the cache."""
+    """How much of the output of a chunk lies in each cell of its point; few seeds at a time, which
+    stay in the cache."""
     samples = output.shape[1]
     below, above = low.astype(output.dtype), high.astype(output.dtype)
     scale, first = CELLS / (above - below), CELLS * np.arange(samples, dtype=np.int32)
@@ -108,12 +126,17 @@ def merged(first: RunningMoments, second: RunningMoments) -> RunningMoments:
     """Both together; they must not share a chunk."""
     a, b = ((t.seeds[:, None], t.mean, t.squares) for t in (first, second))
     count, mean, squares = _merged(a, b)
-    exact, low, high = (np.where(np.isnan(x), y, x) for x, y in zip(first[3:6], second[3:6], strict=True))
+    exact, low, high = (
+        np.where(np.isnan(x), y, x) for x, y in zip(first[3:6], second[3:6], strict=True)
+    )
     return RunningMoments(count[:, 0], mean, squares, exact, low, high, first.cells + second.cells)
 
 
-def quantiles(kept: RunningMoments, levels: tuple[float, ...]) -> Float[np.ndarray, "points levels samples"]:
-    """Quantiles of the output: exact, or linear within their cell (1/32 of a standard deviation); NaN in an open cell."""
+def quantiles(
+    kept: RunningMoments, levels: tuple[float, ...]
+) -> Float[np.ndarray, "points levels samples"]:
+    """Quantiles of the output: exact, or linear within their cell (1/32 of a standard deviation);
+    NaN in an open cell."""
     found = kept.exact.copy()
     for point in np.flatnonzero(np.isnan(found).all(axis=(1, 2)) & (kept.seeds > 0)):
         low, high, cells = kept.low[point], kept.high[point], kept.cells[point]

@@ -20,7 +20,8 @@ from ._sweep import Sweep
 
 
 def begun_with(place: AbstractPlace) -> Cut | None:
-    """How an existing store was cut, so that it can be resumed with other devices; None if there is none."""
+    """How an existing store was cut, so that it can be resumed with other devices; None if there is
+    none."""
     if not place.exists():
         return None
     settings = json.loads(ensemble_at(place)[SETTINGS])
@@ -36,7 +37,9 @@ def identity(layout: Layout, part: Part | None, kind: dict[str, Any]) -> dict[st
 def about(layout: Layout) -> dict[str, Any]:
     """What was run, as attributes."""
     plan, labels = layout.plan, layout.task.labels if isinstance(layout.task, Sweep) else ()
-    made = run_attributes(layout.task_of(0), plan.rate, plan.grid.dt, plan.grid.substeps, plan.sampling, labels)
+    made = run_attributes(
+        layout.task_of(0), plan.rate, plan.grid.dt, plan.grid.substeps, plan.sampling, labels
+    )
     return made | {"precision": str(jax.numpy.result_type(float))}
 
 
@@ -46,18 +49,34 @@ def settings_of(layout: Layout) -> dict[str, Any]:
     numbers = layout.task.task if isinstance(layout.task, Sweep) else as_numbers(layout.task)
     everything = _digest(str(jax.tree.structure(numbers)), *jax.tree.leaves(numbers))
     seeds = layout.seeds
-    given = f"0 to {len(seeds) - 1}" if isinstance(seeds, range) else f"{len(seeds)}, digest {_digest(seeds)}"
+    given = (
+        f"0 to {len(seeds) - 1}"
+        if isinstance(seeds, range)
+        else f"{len(seeds)}, digest {_digest(seeds)}"
+    )
     parameters = {name: float(value) for name, value in as_numbers(task.parameters).items()}
     return {
-        "task": type(task).__name__, "muscle": type(task.muscle).__name__, "noise": type(task.noise).__name__,
-        "points": layout.points, "parameters": parameters, "inputs and everything else": everything,
-        "key": np.asarray(jax.random.key_data(layout.key)).ravel().tolist(), "seeds": given, "duration": layout.duration,
-        "dt": plan.grid.dt, "rate": plan.rate, "substeps": plan.grid.substeps, "sampling": plan.sampling,
-        "spectrum": task.settings.to_dict(), "control": layout.linear is not None, "chunk": layout.width,
-        "points at once": layout.together, "precision": str(jax.numpy.result_type(float)),
+        "task": type(task).__name__,
+        "muscle": type(task.muscle).__name__,
+        "noise": type(task.noise).__name__,
+        "points": layout.points,
+        "parameters": parameters,
+        "inputs and everything else": everything,
+        "key": np.asarray(jax.random.key_data(layout.key)).ravel().tolist(),
+        "seeds": given,
+        "duration": layout.duration,
+        "dt": plan.grid.dt,
+        "rate": plan.rate,
+        "substeps": plan.grid.substeps,
+        "sampling": plan.sampling,
+        "spectrum": task.settings.to_dict(),
+        "control": layout.linear is not None,
+        "chunk": layout.width,
+        "points at once": layout.together,
+        "precision": str(jax.numpy.result_type(float)),
         "random numbers": layout.recipe.draws._asdict() | {"stream": STREAM},
         "versions": {name: versions()[name] for name in ("jaxmuscle", "jax")},
-    }  # fmt: skip
+    }
 
 
 def _digest(*values: Any) -> str:

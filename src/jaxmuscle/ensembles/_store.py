@@ -1,4 +1,5 @@
-"""Ensembles as zarr stores: written chunk by chunk by one or many processes, resumed, never complete before they are."""
+"""Ensembles as zarr stores: written chunk by chunk by one or many processes, resumed, never
+complete before they are."""
 
 import contextlib
 import json
@@ -14,7 +15,16 @@ import numpy as np
 
 from jaxmuscle._common.errors import StoreError
 
-from ._integrity import CHECKSUM, Document, keys_of_array, keys_of_chunk, require_intact, sealed, stamped, unsealed
+from ._integrity import (
+    CHECKSUM,
+    Document,
+    keys_of_array,
+    keys_of_chunk,
+    require_intact,
+    sealed,
+    stamped,
+    unsealed,
+)
 from ._places import PROGRESS, ROOT, AbstractPlace, place_of
 
 Begin = Literal["new", "resume", "overwrite", "part"]
@@ -25,7 +35,8 @@ OPENING = threading.Lock()  # of what changes settings of the whole process for 
 
 
 class Variable(NamedTuple):
-    """An array of a store: its dimensions and shape, how it is cut, and what is known of it at the start (NaN if None)."""
+    """An array of a store: its dimensions and shape, how it is cut, and what is known of it at the
+    start (NaN if None)."""
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
@@ -36,44 +47,70 @@ class Variable(NamedTuple):
 
 
 def create(
-    place: AbstractPlace, variables: Mapping[str, Variable], coordinates: list[str], attributes: dict[str, Any]
+    place: AbstractPlace,
+    variables: Mapping[str, Variable],
+    coordinates: list[str],
+    attributes: dict[str, Any],
 ) -> bool:
-    """A new, incomplete store, which appears whole or not at all; False if another process was faster.
+    """A new, incomplete store, which appears whole or not at all; False if another process was
+    faster.
 
     **Raises:** `StoreError` if another has begun it with other settings.
     """
     with writing(place):
-        _refuse(place, json.loads(place.claim(attributes[SETTINGS])), json.loads(attributes[SETTINGS]))
+        _refuse(
+            place, json.loads(place.claim(attributes[SETTINGS])), json.loads(attributes[SETTINGS])
+        )
         with place.building() as folder:
             _build(folder, variables, coordinates, attributes)
             return place.put(folder)
 
 
-def _build(folder: Path, variables: Mapping[str, Variable], coordinates: list[str], attributes: dict[str, Any]) -> None:
+def _build(
+    folder: Path,
+    variables: Mapping[str, Variable],
+    coordinates: list[str],
+    attributes: dict[str, Any],
+) -> None:
     import zarr
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     labels = [name for name in coordinates if variables[name].dims != (name,)]
     group = zarr.open_group(folder, mode="w", zarr_format=3)
-    group.attrs.update(attributes | ({"coordinates": " ".join(labels)} if labels else {}) | {"complete": False})
+    group.attrs.update(
+        attributes | ({"coordinates": " ".join(labels)} if labels else {}) | {"complete": False}
+    )
     for name, v in variables.items():
         fill = np.nan if np.issubdtype(np.dtype(v.dtype), np.floating) else None
-        dtype = "string" if np.dtype(v.dtype).kind == "U" else v.dtype  # fixed width is not in the specification
-        group.create_array(name, shape=v.shape, chunks=v.chunks, dtype=dtype, dimension_names=v.dims, fill_value=fill,
-                           compressors=(ZstdCodec(), Crc32cCodec()),
-                           attributes={"units": v.units} if v.units else {})  # fmt: skip
+        # fixed width is not in the specification
+        dtype = "string" if np.dtype(v.dtype).kind == "U" else v.dtype
+        group.create_array(
+            name,
+            shape=v.shape,
+            chunks=v.chunks,
+            dtype=dtype,
+            dimension_names=v.dims,
+            fill_value=fill,
+            compressors=(ZstdCodec(), Crc32cCodec()),
+            attributes={"units": v.units} if v.units else {},
+        )
     with OPENING, warnings.catch_warnings():
         # A copy of all arrays' metadata at the root, where xarray looks for it first.
-        warnings.filterwarnings("ignore", "Consolidated metadata is currently not part", category=UserWarning)
+        warnings.filterwarnings(
+            "ignore", "Consolidated metadata is currently not part", category=UserWarning
+        )
         zarr.consolidate_metadata(folder)
-    for name, array in _arrays(folder, [name for name, v in variables.items() if v.values is not None]).items():
+    for name, array in _arrays(
+        folder, [name for name, v in variables.items() if v.values is not None]
+    ).items():
         array[...] = variables[name].values
     document = json.loads((folder / ROOT).read_text(encoding="utf-8"))
     (folder / ROOT).write_bytes(text_of(stamped(document)))
 
 
 def _arrays(opened: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Arrays of a store, which write every chunk: that one is not there must mean that it was lost."""
+    """Arrays of a store, which write every chunk: that one is not there must mean that it was
+    lost."""
     import zarr
 
     with OPENING, zarr.config.set({"array.write_empty_chunks": True}):
@@ -88,11 +125,14 @@ def text_of(document: Document) -> bytes:
 
 @contextlib.contextmanager
 def writing(place: AbstractPlace) -> Iterator[None]:
-    """What the system refuses (a full disk, a folder without permission) becomes an error with the way on."""
+    """What the system refuses (a full disk, a folder without permission) becomes an error with the
+    way on."""
     try:
         yield
     except OSError as error:
-        remedy = "what is complete stays: make room, or permission, and resume (--resume, resume=True)"
+        remedy = (
+            "what is complete stays: make room, or permission, and resume (--resume, resume=True)"
+        )
         raise OSError(error.errno, f"{error.strerror or error}; {remedy}", place.name) from error
 
 
@@ -125,20 +165,25 @@ def _document(place: AbstractPlace) -> Document:
             raise ValueError("no attributes")
         return document
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{place.name}: is not a store that jaxmuscle wrote, or its {ROOT} is damaged ({error}); give "
-                         "another name") from None  # fmt: skip
+        raise StoreError(
+            f"{place.name}: is not a store that jaxmuscle wrote, or its {ROOT} is damaged"
+            f" ({error}); give another name"
+        ) from None
 
 
 def state_of(place: AbstractPlace, wanted: dict[str, Any], *, begin: Begin) -> str:
     """Whether a store of these attributes is "absent", to be "overwritten", "begun" or "complete".
 
-    **Raises:** `StoreError` if it is there and not to be resumed, was made with other settings (named) or in other parts.
+    **Raises:** `StoreError` if it is there and not to be resumed, was made with other settings
+    (named) or in other parts.
     """
     if not place.exists():
         return "absent"
     if begin == "new":
-        raise StoreError(f"{place.name}: exists already; resume it (--resume, resume=True), overwrite it (--force, "
-                         "overwrite=True), or give another name")  # fmt: skip
+        raise StoreError(
+            f"{place.name}: exists already; resume it (--resume, resume=True), overwrite it"
+            " (--force, overwrite=True), or give another name"
+        )
     if begin == "overwrite":
         _require_ensemble(place, _document(place)["attributes"])
         return "overwritten"
@@ -148,20 +193,30 @@ def state_of(place: AbstractPlace, wanted: dict[str, Any], *, begin: Begin) -> s
         return "complete"
     there = found.get(PARTS)
     if there != wanted.get(PARTS):
-        made, remedy = ("without parts", "resume it without --part, part=") if there is None else (
-            f"in {there} parts", f"run each with --part I/{there}, part=(i, {there}), then merge them (jaxmuscle merge)"
-        )  # fmt: skip
+        made, remedy = (
+            ("without parts", "resume it without --part, part=")
+            if there is None
+            else (
+                f"in {there} parts",
+                (
+                    f"run each with --part I/{there}, part=(i, {there}), then merge them (jaxmuscle"
+                    " merge)"
+                ),
+            )
+        )
         raise StoreError(f"{place.name}: is being made {made}: {remedy}, or give another name")
     return "begun"
 
 
 def ensemble_at(place: AbstractPlace) -> dict[str, Any]:
-    """Attributes of an ensemble's store. **Raises:** `StoreError` if it is something else, or damaged."""
+    """Attributes of an ensemble's store. **Raises:** `StoreError` if it is something else, or
+    damaged."""
     return description_of(place)["attributes"]
 
 
 def description_of(place: AbstractPlace) -> Document:
-    """The whole description of an ensemble's store. **Raises:** `StoreError` if it is something else, or damaged."""
+    """The whole description of an ensemble's store. **Raises:** `StoreError` if it is something
+    else, or damaged."""
     document = _document(place)
     _require_ensemble(place, document["attributes"])
     if "random numbers" in document["attributes"][SETTINGS]:
@@ -171,17 +226,24 @@ def description_of(place: AbstractPlace) -> Document:
 
 def _require_ensemble(place: AbstractPlace, attributes: dict[str, Any]) -> None:
     if SETTINGS not in attributes or "complete" not in attributes:
-        raise StoreError(f"{place.name}: is not an ensemble that can be resumed (no settings in it); give another name")
+        raise StoreError(
+            f"{place.name}: is not an ensemble that can be resumed (no settings in it); give"
+            " another name"
+        )
 
 
 def _refuse(place: AbstractPlace, there: dict[str, Any], here: dict[str, Any]) -> None:
     if "random numbers" not in there:
-        raise StoreError(f"{place.name}: was begun by an earlier version of jaxmuscle, whose seeds have other noise. So it "
-                         "cannot go on: begin it anew (--force, overwrite=True), or give another name")  # fmt: skip
+        raise StoreError(
+            f"{place.name}: was begun by an earlier version of jaxmuscle, whose seeds have other"
+            " noise. So it cannot go on: begin it anew (--force, overwrite=True), or give another"
+            " name"
+        )
     different = differences(there, here)
     if different:
         raise StoreError(
-            f"{place.name}: was made with other settings: {'; '.join(different)}. Repeat them, or give another name"
+            f"{place.name}: was made with other settings: {'; '.join(different)}. Repeat them, or"
+            " give another name"
         )
 
 
@@ -190,7 +252,9 @@ def differences(there: Any, here: Any, name: str = "") -> list[str]:
     if isinstance(there, dict) and isinstance(here, dict):
         keys = [*there, *(key for key in here if key not in there)]
         return [
-            line for key in keys for line in differences(there.get(key), here.get(key), f"{name}.{key}" if name else key)
+            line
+            for key in keys
+            for line in differences(there.get(key), here.get(key), f"{name}.{key}" if name else key)
         ]
     return [] if there == here else [f"{name} = {_short(there)} there, {_short(here)} here"]
 
@@ -220,9 +284,11 @@ Log = Callable[[int, list[list[int]]], None]
 
 @contextlib.contextmanager
 def chunk_log(place: AbstractPlace) -> Iterator[Log]:
-    """What is called with every chunk that has been written, and the (point, seed) that failed in it.
+    """What is called with every chunk that has been written, and the (point, seed) that failed in
+    it.
 
-    The chunks are put on disk, then said to be there, together every second and at the end: one by one it takes far longer.
+    The chunks are put on disk, then said to be there, together every second and at the end: one by
+    one it takes far longer.
     """
     document, waiting, due = _document(place), {}, 0.0
 
@@ -253,16 +319,28 @@ def done_key(chunk: int) -> str:
 def say_done(place: AbstractPlace, chunks: Mapping[int, list[list[int]]]) -> None:
     """These chunks are on disk, and these (point, seed) failed in them."""
     with writing(place):
-        place.write({done_key(chunk): sealed(json.dumps(failed).encode()) for chunk, failed in chunks.items()})
+        place.write(
+            {
+                done_key(chunk): sealed(json.dumps(failed).encode())
+                for chunk, failed in chunks.items()
+            }
+        )
 
 
 def logged(place: AbstractPlace, among: Iterable[int] | None = None) -> dict[int, list[list[int]]]:
-    """Complete chunks of a store of trajectories, all or `among` these, with the (point, seed) that failed in them."""
-    keys = {int(key.removeprefix(DONE)[:8]): key for key in place.progress() if key.startswith(DONE)}
+    """Complete chunks of a store of trajectories, all or `among` these, with the (point, seed) that
+    failed in them."""
+    keys = {
+        int(key.removeprefix(DONE)[:8]): key for key in place.progress() if key.startswith(DONE)
+    }
     numbers = sorted(keys.keys() if among is None else keys.keys() & set(among))
     with ThreadPoolExecutor() as pool:  # an object store takes tens of milliseconds for each
         found = pool.map(lambda number: unsealed(place.read(keys[number]) or b""), numbers)
-        return {number: json.loads(data) for number, data in zip(numbers, found, strict=True) if data is not None}
+        return {
+            number: json.loads(data)
+            for number, data in zip(numbers, found, strict=True)
+            if data is not None
+        }
 
 
 def complete(place: AbstractPlace, attributes: dict[str, Any]) -> None:
@@ -276,4 +354,6 @@ def describe(place: AbstractPlace, attributes: dict[str, Any]) -> None:
     """Set attributes of a store."""
     document = description_of(place)
     with writing(place):
-        place.write({ROOT: text_of(stamped(document | {"attributes": document["attributes"] | attributes}))})
+        place.write(
+            {ROOT: text_of(stamped(document | {"attributes": document["attributes"] | attributes}))}
+        )

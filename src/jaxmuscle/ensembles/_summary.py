@@ -1,4 +1,5 @@
-"""What is left of an ensemble that was reduced while it ran: moments, quantiles and the mean spectrum."""
+"""What is left of an ensemble that was reduced while it ran: moments, quantiles and the mean
+spectrum."""
 
 import dataclasses
 import json
@@ -25,18 +26,24 @@ if TYPE_CHECKING:
 
 
 # Fields of a spectrum, and their names as arrays.
-SPECTRUM = {"power": "power", "stderr": "power_stderr", "plain_power": "plain_power", "plain_stderr": "plain_stderr",
-            "expected": "power_expected"}  # fmt: skip
+SPECTRUM = {
+    "power": "power",
+    "stderr": "power_stderr",
+    "plain_power": "plain_power",
+    "plain_stderr": "plain_stderr",
+    "expected": "power_expected",
+}
 
 
 class EnsembleSummary(Printed, Result, eqx.Module):
     """An ensemble reduced to its moments; of a sweep all arrays have a leading axis `point`.
 
-    `mean` and `variance` of the output at every `time` [s] over the seeds that stayed finite, `quantile` at `levels`;
-    `coefficient_of_variation` of single seeds, low-passed, in the analysed window with its standard error, `spectra` (one
-    `SpectrumEstimate` per point): NaN and empty if the run does not cover the window; `seeds` per point; `failed`, rows
-    (point, seed) of those that did not stay finite and were left out; `success`, whether there are none; `about`, how it
-    was run.
+    `mean` and `variance` of the output at every `time` [s] over the seeds that stayed finite,
+    `quantile` at `levels`; `coefficient_of_variation` of single seeds, low-passed, in the analysed
+    window with its standard error, `spectra` (one `SpectrumEstimate` per point): NaN and empty if
+    the run does not cover the window; `seeds` per point; `failed`, rows (point, seed) of those that
+    did not stay finite and were left out; `success`, whether there are none; `about`, how it was
+    run.
     """
 
     task: AbstractTask | Sweep
@@ -63,14 +70,21 @@ class EnsembleSummary(Printed, Result, eqx.Module):
             return "every seed stayed finite"
         swept = isinstance(self.task, Sweep)
         names = [f"{seed} of point {point}" if swept else seed for point, seed in self.failed]
-        return (f"{len(names)} seed(s) did not stay finite and are left out ({listed(names)}): lower the noise amplitude "
-                "or dt")  # fmt: skip
+        return (
+            f"{len(names)} seed(s) did not stay finite and are left out ({listed(names)}): lower"
+            " the noise amplitude or dt"
+        )
 
     @property
     def spectrum(self) -> SpectrumEstimate:
-        """The mean spectrum of one task. Raises `ValueError` for a sweep (see `spectra`) and where there is none."""
+        """The mean spectrum of one task. Raises `ValueError` for a sweep (see `spectra`) and where
+        there is none."""
         if isinstance(self.task, Sweep) or not self.spectra:
-            reason = "a sweep has one per point: use `spectra`" if self.spectra else "the run does not cover 5 s to 15 s"
+            reason = (
+                "a sweep has one per point: use `spectra`"
+                if self.spectra
+                else "the run does not cover 5 s to 15 s"
+            )
             raise ValueError(f"there is no single spectrum: {reason}")
         return self.spectra[0]
 
@@ -79,21 +93,29 @@ class EnsembleSummary(Printed, Result, eqx.Module):
         return self.task[0] if isinstance(self.task, Sweep) else self.task
 
     def plot(self, ax: "Axes | None" = None, point: int = 0) -> "Axes":
-        """Median (or mean) and the band between the outermost quantiles against time. Returns the axes."""
+        """Median (or mean) and the band between the outermost quantiles against time. Returns the
+        axes."""
         return plot.moments(self, ax, point)
 
     def to_xarray(self) -> "xarray.Dataset":
-        """A Dataset with dimensions (point,) time, quantile, frequency; units, parameters and settings as attributes."""
+        """A Dataset with dimensions (point,) time, quantile, frequency; units, parameters and
+        settings as attributes."""
         import xarray
 
-        data = {name: (dims, values, {"units": units} if units else {})
-                for name, (dims, values, units) in self.arrays().items()}  # fmt: skip
+        data = {
+            name: (dims, values, {"units": units} if units else {})
+            for name, (dims, values, units) in self.arrays().items()
+        }
         return xarray.Dataset(data, attrs=self.attributes()).set_coords(self.coordinates())
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row for each (point and) time: `time`, `mean`, `variance`, and a column for each quantile, as `quantile_0.5`."""
+        """A row for each (point and) time: `time`, `mean`, `variance`, and a column for each
+        quantile, as `quantile_0.5`."""
         data = self.to_xarray()
-        levels = {f"quantile_{level:g}": data["quantiles"].sel(quantile=level, drop=True) for level in self.levels}
+        levels = {
+            f"quantile_{level:g}": data["quantiles"].sel(quantile=level, drop=True)
+            for level in self.levels
+        }
         return data[["mean", "variance"]].assign(levels).to_dataframe().reset_index()
 
     def coordinates(self) -> list[str]:
@@ -119,7 +141,11 @@ class EnsembleSummary(Printed, Result, eqx.Module):
         if self.spectra:
             found["frequency"] = ("frequency",), np.asarray(self.spectra[0].frequency), "Hz"
             found["coefficient_of_variation"] = lead, self.coefficient_of_variation[..., 0], "1"
-            found["coefficient_of_variation_stderr"] = lead, self.coefficient_of_variation[..., 1], "1"
+            found["coefficient_of_variation_stderr"] = (
+                lead,
+                self.coefficient_of_variation[..., 1],
+                "1",
+            )
             for name, label in SPECTRUM.items():
                 rows = [getattr(spectrum, name) for spectrum in self.spectra]
                 if rows[0] is not None:
@@ -129,25 +155,48 @@ class EnsembleSummary(Printed, Result, eqx.Module):
             found |= {name: (("point",), values, "") for name, values in self.task.labels.items()}
         return found
 
-    def with_arrays(self, arrays: dict[str, np.ndarray], failed: Int[np.ndarray, "failed 2"]) -> "EnsembleSummary":
+    def with_arrays(
+        self, arrays: dict[str, np.ndarray], failed: Int[np.ndarray, "failed 2"]
+    ) -> "EnsembleSummary":
         """A copy with the values of `arrays` (as `arrays()` names them) and other failed seeds."""
         variation, spectra = self.coefficient_of_variation, self.spectra
         if spectra:
-            variation = np.stack([arrays["coefficient_of_variation"], arrays["coefficient_of_variation_stderr"]], axis=-1)
-            rows = {name: np.atleast_2d(arrays[label]) for name, label in SPECTRUM.items() if label in arrays}
-            left = [self.seeds - int(np.sum(failed[:, 0] == point)) for point in range(len(spectra))]
+            variation = np.stack(
+                [arrays["coefficient_of_variation"], arrays["coefficient_of_variation_stderr"]],
+                axis=-1,
+            )
+            rows = {
+                name: np.atleast_2d(arrays[label])
+                for name, label in SPECTRUM.items()
+                if label in arrays
+            }
+            left = [
+                self.seeds - int(np.sum(failed[:, 0] == point)) for point in range(len(spectra))
+            ]
             spectra = tuple(
-                dataclasses.replace(spectrum, seeds=left[i], **{name: values[i] for name, values in rows.items()})
+                dataclasses.replace(
+                    spectrum, seeds=left[i], **{name: values[i] for name, values in rows.items()}
+                )
                 for i, spectrum in enumerate(spectra)
             )
-        return dataclasses.replace(self, mean=arrays["mean"], variance=arrays["variance"], quantile=arrays["quantiles"],
-                                   coefficient_of_variation=variation, spectra=spectra, failed=failed)  # fmt: skip
+        return dataclasses.replace(
+            self,
+            mean=arrays["mean"],
+            variance=arrays["variance"],
+            quantile=arrays["quantiles"],
+            coefficient_of_variation=variation,
+            spectra=spectra,
+            failed=failed,
+        )
 
     def __str__(self) -> str:
         swept = isinstance(self.task, Sweep)
         where = f", {len(self.task)} points" if isinstance(self.task, Sweep) else ""
         lines = [
-            f"ensemble: {type(self._first).__name__}, {self.seeds} seeds{where}, {self.time[-1]:g} s",
+            (
+                f"ensemble: {type(self._first).__name__}, {self.seeds} seeds{where},"
+                f" {self.time[-1]:g} s"
+            ),
             f"  {self.message}",
         ]
         if self.spectra and not swept and self._first.quantity != "acceleration":
@@ -157,25 +206,41 @@ class EnsembleSummary(Printed, Result, eqx.Module):
 
 
 def computed(
-    tally: RunningMoments, levels: tuple[float, ...], expected: Float[np.ndarray, "points bins"] | None
+    tally: RunningMoments,
+    levels: tuple[float, ...],
+    expected: Float[np.ndarray, "points bins"] | None,
 ) -> dict[str, Float[np.ndarray, "points ..."]]:
-    """All that a tally says, by the names of `EnsembleSummary.arrays`; `expected`, the exact linear spectra or None."""
+    """All that a tally says, by the names of `EnsembleSummary.arrays`; `expected`, the exact linear
+    spectra or None."""
     samples = tally.low.shape[1]
-    bins = (tally.mean.shape[1] - samples) // 2  # then come power, what the linear response leaves of it, and variation
+    # then come power, what the linear response leaves of it, and variation
+    bins = (tally.mean.shape[1] - samples) // 2
     with np.errstate(invalid="ignore", divide="ignore"):
         seen = np.where(tally.seeds > 0, tally.seeds, np.nan)[:, None]
         averages = tally.mean + 0 * seen
         variance = tally.squares / np.where(seen > 1, seen - 1, np.nan)
         stderr = np.sqrt(variance / seen)
-    found = {"mean": averages[:, :samples], "variance": variance[:, :samples], "quantiles": quantiles(tally, levels)}
+    found = {
+        "mean": averages[:, :samples],
+        "variance": variance[:, :samples],
+        "quantiles": quantiles(tally, levels),
+    }
     if bins:
         plain, left = slice(samples, samples + bins), slice(samples + bins, samples + 2 * bins)
-        found |= {"coefficient_of_variation": averages[:, -1], "coefficient_of_variation_stderr": stderr[:, -1],
-                  "plain_power": averages[:, plain], "plain_stderr": stderr[:, plain]}  # fmt: skip
+        found |= {
+            "coefficient_of_variation": averages[:, -1],
+            "coefficient_of_variation_stderr": stderr[:, -1],
+            "plain_power": averages[:, plain],
+            "plain_stderr": stderr[:, plain],
+        }
         if expected is None:
             found |= {"power": averages[:, plain], "power_stderr": stderr[:, plain]}
         else:
-            found |= {"power": expected + averages[:, left], "power_stderr": stderr[:, left], "power_expected": expected}
+            found |= {
+                "power": expected + averages[:, left],
+                "power_stderr": stderr[:, left],
+                "power_expected": expected,
+            }
     return found
 
 
@@ -195,11 +260,33 @@ def summarised(
     unit, points = (task[0] if isinstance(task, Sweep) else task).output_unit, len(tally.seeds)
     variation, spectra = np.full((points, 2), np.nan), []
     if "power" in arrays:
-        variation = np.stack([arrays["coefficient_of_variation"], arrays["coefficient_of_variation_stderr"]], axis=-1)
+        variation = np.stack(
+            [arrays["coefficient_of_variation"], arrays["coefficient_of_variation_stderr"]], axis=-1
+        )
         for i, seen in enumerate(tally.seeds):
-            row: dict[str, Any] = {name: arrays[label][i] for name, label in SPECTRUM.items() if label in arrays}
+            row: dict[str, Any] = {
+                name: arrays[label][i] for name, label in SPECTRUM.items() if label in arrays
+            }
             row = {"expected": None} | row
-            spectra.append(SpectrumEstimate(settings.frequency, **row, seeds=int(seen), settings=settings, unit=unit))
+            spectra.append(
+                SpectrumEstimate(
+                    settings.frequency, **row, seeds=int(seen), settings=settings, unit=unit
+                )
+            )
     found = [arrays["mean"], arrays["variance"], arrays["quantiles"], variation]
-    mean, variance, quantile, variation = found if isinstance(task, Sweep) else [values[0] for values in found]
-    return EnsembleSummary(task, seeds, time, mean, variance, levels, quantile, variation, tuple(spectra), failed, about)
+    mean, variance, quantile, variation = (
+        found if isinstance(task, Sweep) else [values[0] for values in found]
+    )
+    return EnsembleSummary(
+        task,
+        seeds,
+        time,
+        mean,
+        variance,
+        levels,
+        quantile,
+        variation,
+        tuple(spectra),
+        failed,
+        about,
+    )

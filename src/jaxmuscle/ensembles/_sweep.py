@@ -1,4 +1,5 @@
-"""Many tasks in one ensemble: a grid of parameters, a design, draws from a posterior, or different persons."""
+"""Many tasks in one ensemble: a grid of parameters, a design, draws from a posterior, or different
+persons."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,13 +23,15 @@ if TYPE_CHECKING:
 class Sweep(Shown, eqx.Module):
     """Tasks of one kind with different numbers, as an axis `point` of an ensemble.
 
-    `Sweep.grid(task, k_w=[...], c_w=[...])` is every combination, the last name fastest; `Sweep.design(task, {name:
-    values})` one point for each row of equally long columns, such as `posterior.samples`; `Sweep.of(tasks)` any tasks that
-    differ in numbers only, such as the fits of several persons. `len(sweep)` is the number of points, `sweep[i]` the task
-    of point i; `labels` {name: values} say what differs; `task` holds the tasks of all points in one, each of its numbers an
-    array with a leading axis of points.
+    `Sweep.grid(task, k_w=[...], c_w=[...])` is every combination, the last name fastest;
+    `Sweep.design(task, {name: values})` one point for each row of equally long columns, such as
+    `posterior.samples`; `Sweep.of(tasks)` any tasks that differ in numbers only, such as the fits
+    of several persons. `len(sweep)` is the number of points, `sweep[i]` the task of point i;
+    `labels` {name: values} say what differs; `task` holds the tasks of all points in one, each of
+    its numbers an array with a leading axis of points.
 
-    Seed i has the same noise at every point (common random numbers), so differences between points are sharp.
+    Seed i has the same noise at every point (common random numbers), so differences between points
+    are sharp.
     """
 
     task: AbstractTask
@@ -43,7 +46,8 @@ class Sweep(Shown, eqx.Module):
 
     @staticmethod
     def of(tasks: Sequence[AbstractTask], names: Sequence[str] | None = None) -> "Sweep":
-        """The given tasks, labelled by `names`, if you give them, and by the parameters that differ.
+        """The given tasks, labelled by `names`, if you give them, and by the parameters that
+        differ.
 
         **Raises:** `ValueError` for no task, and for tasks that differ in more than numbers.
         """
@@ -53,10 +57,17 @@ class Sweep(Shown, eqx.Module):
         shape = _shape(numbers[0])
         for i, task in enumerate(numbers):
             if _shape(task) != shape:
-                raise ValueError(f"task {i} of the sweep differs from task 0 in more than numbers ({_parts(numbers[0])} "
-                                 f"against {_parts(task)}): simulate such tasks one by one")  # fmt: skip
-        task = jax.tree.map(lambda *leaves: np.stack([np.asarray(x, dtype=float) for x in leaves]), *numbers)
-        labels: dict[str, np.ndarray] = {} if names is None else {"name": np.array([str(n) for n in names])}
+                raise ValueError(
+                    f"task {i} of the sweep differs from task 0 in more than numbers"
+                    f" ({_parts(numbers[0])} against {_parts(task)}): simulate such tasks one"
+                    " by one"
+                )
+        task = jax.tree.map(
+            lambda *leaves: np.stack([np.asarray(x, dtype=float) for x in leaves]), *numbers
+        )
+        labels: dict[str, np.ndarray] = (
+            {} if names is None else {"name": np.array([str(n) for n in names])}
+        )
         if names is not None and len(names) != len(tasks):
             raise ValueError(f"names has {len(names)} entries for {len(tasks)} tasks")
         for name in numbers[0].parameter_names:
@@ -68,18 +79,25 @@ class Sweep(Shown, eqx.Module):
     @staticmethod
     def grid(task: AbstractTask, **values: Any) -> "Sweep":
         """Every combination of the values. Raises as `design` does."""
-        rows = np.array(list(itertools.product(*(np.atleast_1d(v) for v in values.values()))), dtype=float)
+        rows = np.array(
+            list(itertools.product(*(np.atleast_1d(v) for v in values.values()))), dtype=float
+        )
         return Sweep.design(task, dict(zip(values, rows.reshape(-1, len(values)).T, strict=True)))
 
     @staticmethod
     def design(task: AbstractTask, values: Mapping[str, Any]) -> "Sweep":
         """One point for each entry of the columns, in the units of the table of parameters.
 
-        Columns may have several axes (as chains and draws) if all have the same shape; the last axis runs fastest.
+        Columns may have several axes (as chains and draws) if all have the same shape; the last
+        axis runs fastest.
 
-        **Raises:** `ValueError` for an unknown name, a value outside its bounds, columns of different lengths, no point.
+        **Raises:** `ValueError` for an unknown name, a value outside its bounds, columns of
+        different lengths, no point.
         """
-        columns = {name: np.asarray(column, dtype=float).ravel() for name, column in proper_values(values).items()}
+        columns = {
+            name: np.asarray(column, dtype=float).ravel()
+            for name, column in proper_values(values).items()
+        }
         sizes = {name: column.size for name, column in columns.items()}
         if len(set(sizes.values())) != 1 or 0 in sizes.values():
             raise ValueError(f"a design needs columns of one length of at least 1, not {sizes}")
@@ -89,7 +107,9 @@ class Sweep(Shown, eqx.Module):
             bad = np.flatnonzero(~((column >= low) & (column <= high) & np.isfinite(column)))
             if bad.size:
                 span = "a finite number" if row is None else row.range
-                raise ValueError(f"{name} = {column[bad[0]]:g} at point {bad[0]} is outside its range, {span}")
+                raise ValueError(
+                    f"{name} = {column[bad[0]]:g} at point {bad[0]} is outside its range, {span}"
+                )
         with jax.enable_x64(True):
             put = jax.jit(jax.vmap(lambda row: as_arrays(task).replace(**row)))
             made = Sweep(jax.tree.map(np.asarray, put(columns)), columns)
@@ -119,9 +139,17 @@ def _differing(labels: Mapping[str, np.ndarray]) -> list[tuple[str, str]]:
     rows = []
     for name, values in labels.items():
         known, unit = np.unique(values), PARAMETERS[name].unit if name in PARAMETERS else ""
-        first, last = (f"{end:.4g}" if values.dtype.kind == "f" else str(end) for end in (known[0], known[-1]))
+        first, last = (
+            f"{end:.4g}" if values.dtype.kind == "f" else str(end) for end in (known[0], known[-1])
+        )
         ends = f"{first} to {last} {unit}" if len(known) > 1 else f"{first} {unit}"
-        rows.append((name, ends.removesuffix(" 1").strip() + (f", {len(known)} values" if len(known) > 1 else "")))
+        rows.append(
+            (
+                name,
+                ends.removesuffix(" 1").strip()
+                + (f", {len(known)} values" if len(known) > 1 else ""),
+            )
+        )
     return rows
 
 
@@ -134,17 +162,24 @@ def _parts(task: AbstractTask) -> str:
 
 
 class Population(Shown, eqx.Module):
-    """Ensembles of every point of `sweep`: `population[i]`, which is `members[i]`, is the `Trajectory` of point i."""
+    """Ensembles of every point of `sweep`: `population[i]`, which is `members[i]`, is the
+    `Trajectory` of point i."""
 
     sweep: Sweep
     members: tuple[Trajectory, ...]
 
     def _card(self) -> Card:
-        if not isinstance(self.sweep, Sweep) or not all(isinstance(member, Trajectory) for member in self.members):
+        if not isinstance(self.sweep, Sweep) or not all(
+            isinstance(member, Trajectory) for member in self.members
+        ):
             return Card(eqx.tree_pformat(self))
         first = self.members[0]
-        known = [("task", type(first.task).__name__), ("time", f"0 to {first.time[-1]:g} s at {first.rate:g} Hz"),
-                 ("seeds", f"{np.size(first.seeds)} at every point"), *_differing(self.sweep.labels)]  # fmt: skip
+        known = [
+            ("task", type(first.task).__name__),
+            ("time", f"0 to {first.time[-1]:g} s at {first.rate:g} Hz"),
+            ("seeds", f"{np.size(first.seeds)} at every point"),
+            *_differing(self.sweep.labels),
+        ]
         what = f"{first.task.output_name} [{first.task.output_unit}]"
         return _facts(f"{len(self)} ensembles of {what}: [i] is that of point i", known)
 
@@ -158,8 +193,13 @@ class Population(Shown, eqx.Module):
         return iter(self.members)
 
     def to_xarray(self) -> "xarray.Dataset":
-        """A Dataset with dimensions point, seed, time, labelled by what differs between the points."""
+        """A Dataset with dimensions point, seed, time, labelled by what differs between the
+        points."""
         import xarray
 
-        joined = xarray.concat([member.to_xarray() for member in self.members], "point", combine_attrs="drop_conflicts")
-        return joined.assign_coords({name: ("point", values) for name, values in self.sweep.labels.items()})
+        joined = xarray.concat(
+            [member.to_xarray() for member in self.members], "point", combine_attrs="drop_conflicts"
+        )
+        return joined.assign_coords(
+            {name: ("point", values) for name, values in self.sweep.labels.items()}
+        )

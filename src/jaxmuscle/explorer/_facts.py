@@ -1,4 +1,5 @@
-"""What the page knows of the package, so that JavaScript repeats none of it: parameters, ranges, tasks, noises, settings."""
+"""What the page knows of the package, so that JavaScript repeats none of it: parameters, ranges,
+tasks, noises, settings."""
 
 import math
 from typing import Any, get_args
@@ -22,9 +23,14 @@ def facts() -> dict[str, Any]:
     tasks = {name: kind() for name, kind in TASKS.items()}
     made: dict[str, Any] = dict(NOISES)
     kinds = {name: kind().per_channel() for name, kind in made.items()}
-    needed = {name: list(task.smoothness_needed) for name, task in tasks.items() if name != "prescribed-force"}
+    needed = {
+        name: list(task.smoothness_needed)
+        for name, task in tasks.items()
+        if name != "prescribed-force"
+    }
     needed |= {
-        f"prescribed-force {seen}": list(PrescribedForce(observe=seen).smoothness_needed) for seen in get_args(Observed)
+        f"prescribed-force {seen}": list(PrescribedForce(observe=seen).smoothness_needed)
+        for seen in get_args(Observed)
     }
     richest = on_rung(Isometric(), 3)
     return {
@@ -32,9 +38,15 @@ def facts() -> dict[str, Any]:
         "usually_free": list(USUALLY_FREE),
         "tasks": {name: bare_table(task) for name, task in tasks.items()},
         "noises": {name: noise_table(noise) for name, noise in kinds.items()},
-        "resonances": [noise_table(part) for part in richest.noise.components if isinstance(part, ResonantNoise)],
+        "resonances": [
+            noise_table(part)
+            for part in richest.noise.components
+            if isinstance(part, ResonantNoise)
+        ],
         "settings": {name: SpectrumSettings.named(name).to_dict() for name in NAMED},
-        "smoothness": {type(noise).__name__: noise.smoothness for noise in (*kinds.values(), ResonantNoise())},
+        "smoothness": {
+            type(noise).__name__: noise.smoothness for noise in (*kinds.values(), ResonantNoise())
+        },
         "smoothness_needed": needed,
         "observed": list(get_args(Observed)),
     }
@@ -51,9 +63,13 @@ def noise_table(noise: AbstractNoise) -> dict[str, Any]:
 
 
 def parameter(row: Parameter) -> dict[str, Any]:
-    """A row of the table, with the range of its slider: three standard deviations of its prior, as far as a fit may go."""
+    """A row of the table, with the range of its slider: three standard deviations of its prior, as
+    far as a fit may go."""
     low, high = span(row)
-    found = {key: getattr(row, key) for key in ("unit", "default", "meaning", "positive", "prior_sd", "lower", "upper")}
+    found = {
+        key: getattr(row, key)
+        for key in ("unit", "default", "meaning", "positive", "prior_sd", "lower", "upper")
+    }
     bounds = {key: found[key] if math.isfinite(found[key]) else None for key in ("lower", "upper")}
     off = row.lower == 0 and row.fit_lower == 0 and row.unit == "1"
     return found | bounds | {"low": low, "high": high, "off": off}
@@ -62,5 +78,7 @@ def parameter(row: Parameter) -> dict[str, Any]:
 def span(row: Parameter) -> tuple[float, float]:
     """From where to where its slider goes."""
     far = REACH * row.prior_sd
-    ends = row.default * np.exp([-far, far]) if row.positive else row.default + np.array([-far, far])
+    ends = (
+        row.default * np.exp([-far, far]) if row.positive else row.default + np.array([-far, far])
+    )
     return max(float(ends[0]), row.fit_lower), min(float(ends[1]), row.fit_upper)

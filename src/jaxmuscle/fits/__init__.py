@@ -1,4 +1,5 @@
-"""Fits of one target, of several targets together and of a cohort; their checks, reports and result files.
+"""Fits of one target, of several targets together and of a cohort; their checks, reports and result
+files.
 
 Searches start here; steps are made in `objective`.
 """

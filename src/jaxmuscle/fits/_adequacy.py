@@ -1,4 +1,5 @@
-"""Does the model describe the data? Chi² of a fit against its distribution under the fitted model, and where it fails."""
+"""Does the model describe the data? Chi² of a fit against its distribution under the fitted model,
+and where it fails."""
 
 import dataclasses
 import functools
@@ -30,13 +31,16 @@ from ._refit import STRENGTHS, Refit, refit_of
 ADEQUATE = 0.01
 ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
 REPLICATES = 999
-ELSEWHERE = ("The misfit is in the other data. What comes from these may still be right: fit them alone, and compare (a "
-             "dynamic stiffness with jaxmuscle fit stiffness.csv)")  # fmt: skip
+ELSEWHERE = (
+    "The misfit is in the other data. What comes from these may still be right: fit them alone, and"
+    " compare (a dynamic stiffness with jaxmuscle fit stiffness.csv)"
+)
 Rows = Float[np.ndarray, "replicates residuals"]
 
 
 class Adequacy(NamedTuple):
-    """`chi2` of all data residuals of a fit, what is `expected` of it under the fitted model, and its p-value `p`.
+    """`chi2` of all data residuals of a fit, what is `expected` of it under the fitted model, and
+    its p-value `p`.
 
     `misfit` says in words where the data lie furthest from the model, if it does not describe them.
     """
@@ -53,7 +57,8 @@ class Adequacy(NamedTuple):
 
     @property
     def widening(self) -> float:
-        """By how much standard errors grow where the model does not describe the data, `√(chi² / expected)`."""
+        """By how much standard errors grow where the model does not describe the data, `√(chi² /
+        expected)`."""
         return 1.0 if self.adequate else max(1.0, float(np.sqrt(self.chi2 / self.expected)))
 
 
@@ -80,7 +85,10 @@ class Endpoint:
     def scatter(self) -> Float[np.ndarray, "residuals residuals"]:
         """Covariance of the data residuals of all parts."""
         parts = zip(self.problem.parts, self.objective.parts, self.seen.moments, strict=True)
-        each = [residual_covariance(part.target, own, np.asarray(m.line / m.power)) for part, own, m in parts]
+        each = [
+            residual_covariance(part.target, own, np.asarray(m.line / m.power))
+            for part, own, m in parts
+        ]
         return np.asarray(block_diag(*each))
 
     @functools.cached_property
@@ -95,7 +103,8 @@ class Endpoint:
 
     @functools.cached_property
     def judged(self) -> tuple[Adequacy | None, tuple[str, ...]]:
-        """`adequacy`, and a sentence for each kind of data that the model misses although it describes all data together."""
+        """`adequacy`, and a sentence for each kind of data that the model misses although it
+        describes all data together."""
         return judged(self)
 
     @property
@@ -105,16 +114,19 @@ class Endpoint:
 
     @functools.cached_property
     def further(self) -> tuple[dict[str, float], ...]:
-        """Of every part the residuals of the measured mean and coefficient of variation, in standard deviations."""
+        """Of every part the residuals of the measured mean and coefficient of variation, in
+        standard deviations."""
         return tuple(
-            further_of(part, moments) for part, moments in zip(self.objective.parts, self.seen.moments, strict=True)
+            further_of(part, moments)
+            for part, moments in zip(self.objective.parts, self.seen.moments, strict=True)
         )
 
     @functools.cached_property
     def met(self) -> frozenset[str]:
         """The means and coefficients of variation that were measured and that the fit meets.
 
-        Their errors are those of the measurement: that the spectrum misses its data does not make them less certain.
+        Their errors are those of the measurement: that the spectrum misses its data does not make
+        them less certain.
         """
         several = len(self.problem.parts) > 1
         return frozenset(
@@ -138,8 +150,14 @@ class Endpoint:
 
 def further_of(part: PartResiduals, moments: Moments) -> dict[str, float]:
     """Residuals of a target's coefficient of variation and mean by name."""
-    names = [name for name, given in (("coefficient_of_variation", part.data.variation), ("mean", part.data.mean))
-             if given is not None]  # fmt: skip
+    names = [
+        name
+        for name, given in (
+            ("coefficient_of_variation", part.data.variation),
+            ("mean", part.data.mean),
+        )
+        if given is not None
+    ]
     return dict(zip(names, map(float, np.asarray(_further(moments, part.data))), strict=False))
 
 
@@ -147,21 +165,31 @@ _further = kept(further_residuals)
 
 
 def judged(ended: Endpoint) -> tuple[Adequacy | None, tuple[str, ...]]:
-    """Chi² of the data residuals against its distribution under the fitted model; None where the spread is unknown.
+    """Chi² of the data residuals against its distribution under the fitted model; None where the
+    spread is unknown.
 
-    Also chi² of each kind of data by itself, where there are several: many good points can hide a few bad ones.
+    Also chi² of each kind of data by itself, where there are several: many good points can hide a
+    few bad ones.
 
-    The reference: residuals ε drawn by the law of the bins about the fitted spectrum, and what a refit leaves of them. The
-    parameters are taken as linear there, `(1 - H) ε` with `H = J (Jᵀ J + Λ)⁻¹ Jᵀ`, the pull of the prior included for truths
-    drawn from it; but the line of one harmonic whose amplitude and frequency are free is sought anew, over the whole band,
-    as a fit does.
+    The reference: residuals ε drawn by the law of the bins about the fitted spectrum, and what a
+    refit leaves of them. The parameters are taken as linear there, `(1 - H) ε` with `H = J (Jᵀ J +
+    Λ)⁻¹ Jᵀ`, the pull of the prior included for truths drawn from it; but the line of one harmonic
+    whose amplitude and frequency are free is sought anew, over the whole band, as a fit does.
     """
-    problem, objective, found, scatter, refit = ended.problem, ended.objective, ended.found, ended.scatter, ended.refit
+    problem, objective, found, scatter, refit = (
+        ended.problem,
+        ended.objective,
+        ended.found,
+        ended.scatter,
+        ended.refit,
+    )
     if not all(part.statistics.known for part in objective.parts):
         return None, ()
     generator = generator_of(problem, 5)
     count, rows = len(found.residuals), len(refit.prior)
-    drawn = np.concatenate([_drawn(objective, scatter, generator), generator.normal(size=(REPLICATES, rows))], axis=1)
+    drawn = np.concatenate(
+        [_drawn(objective, scatter, generator), generator.normal(size=(REPLICATES, rows))], axis=1
+    )
     rest = refit.left(drawn, np.argmin(refit.cost(drawn), axis=1))
     here, expected, p = _tested(found.residuals, rest[:, :count])
     misfit = ""
@@ -171,15 +199,22 @@ def judged(ended: Endpoint) -> tuple[Adequacy | None, tuple[str, ...]]:
     kinds = _kinds(problem, objective)
     alone = {words: _tested(found.residuals[rows], rest[:, rows]) for words, rows in kinds.items()}
     if p < ADEQUATE:
-        right = [f"{words} ({probability(each[2])})" for words, each in alone.items() if each[2] >= ADEQUATE]
+        right = [
+            f"{words} ({probability(each[2])})"
+            for words, each in alone.items()
+            if each[2] >= ADEQUATE
+        ]
         return Adequacy(here, expected, p, misfit), tuple(
-            [f"taken alone, the model describes {' and '.join(right)}. {ELSEWHERE}"] * (bool(right) and len(kinds) > 1)
+            [f"taken alone, the model describes {' and '.join(right)}. {ELSEWHERE}"]
+            * (bool(right) and len(kinds) > 1)
         )
     hidden = {words: each for words, each in alone.items() if each[2] < ADEQUATE / len(kinds)}
-    said = tuple(f"the model does not describe {words}, taken alone: chi2 {chi2:.3g}, expected {mean:.3g}, "
-                 f"{probability(own)}. The verdict counts all data together and does not show this. What to do: look at the "
-                 f"residuals of {words} in the figure"
-                 for words, (chi2, mean, own) in hidden.items())  # fmt: skip
+    said = tuple(
+        f"the model does not describe {words}, taken alone: chi2 {chi2:.3g}, expected {mean:.3g},"
+        f" {probability(own)}. The verdict counts all data together and does not show this. What to"
+        f" do: look at the residuals of {words} in the figure"
+        for words, (chi2, mean, own) in hidden.items()
+    )
     return Adequacy(here, expected, p, misfit), said
 
 
@@ -204,22 +239,30 @@ def _kinds(problem: FitProblem, objective: Residuals) -> dict[str, slice]:
 
 
 def elsewhere(ended: Endpoint) -> float:
-    """Which share of the posterior has the harmonic further than a bin from where the fit has it; 0 without a free one.
+    """Which share of the posterior has the harmonic further than a bin from where the fit has it; 0
+    without a free one.
 
-    The lines of `adequacy`'s grid, all else refitted to first order, against the fitted one by its curvature. The covariance
-    of the estimates is larger than the inverse curvature, since neighbouring bins correlate: costs count for less.
+    The lines of `adequacy`'s grid, all else refitted to first order, against the fitted one by its
+    curvature. The covariance of the estimates is larger than the inverse curvature, since
+    neighbouring bins correlate: costs count for less.
     """
     problem, found, refit, sizes = ended.problem, ended.found, ended.refit, ended.covariance
     if not refit.used:
         return 0.0
     (a, f), sd = refit.used, problem.coordinates.sd
     residual = np.concatenate([found.residuals, refit.prior])
-    gain = np.linalg.pinv(found.jacobian.T @ found.jacobian + np.diag(problem.prior), hermitian=True)
+    gain = np.linalg.pinv(
+        found.jacobian.T @ found.jacobian + np.diag(problem.prior), hermitian=True
+    )
     dull = max(1.0, float(sizes[f, f] / gain[f, f]))
     cost = refit.cost(residual[None])[0]
     cost = (cost - cost[-1]) / dull
     apart = np.abs(refit.frequency - refit.frequency[-1])
-    weight = np.where(apart >= problem.parts[0].target.settings.resolution, np.exp(-0.5 * np.clip(cost, -700, 700)), 0.0)
+    weight = np.where(
+        apart >= problem.parts[0].target.settings.resolution,
+        np.exp(-0.5 * np.clip(cost, -700, 700)),
+        0.0,
+    )
     grid = refit.frequency[: len(refit.frequency) // len(STRENGTHS)]
     cell = np.gradient(grid) / grid / sd[f] * 0.5 * np.log(STRENGTHS[1] / STRENGTHS[0]) / sd[a]
     there = float(np.sum(weight[:-1].reshape(-1, len(grid)) * cell))
@@ -232,10 +275,15 @@ def generator_of(problem: FitProblem, number: int) -> np.random.Generator:
     return np.random.default_rng(np.asarray(jax.random.key_data(fold_in(problem.key, number))))
 
 
-def drawn_log_residuals(part: PartResiduals, generator: np.random.Generator, count: int) -> Float[np.ndarray, "rows bins"]:
-    """Log residuals of spectra that scatter about their expectation by the law of the bins: correlated gamma variables."""
+def drawn_log_residuals(
+    part: PartResiduals, generator: np.random.Generator, count: int
+) -> Float[np.ndarray, "rows bins"]:
+    """Log residuals of spectra that scatter about their expectation by the law of the bins:
+    correlated gamma variables."""
     law = part.statistics
-    normal = generator.multivariate_normal(np.zeros(len(law.sd)), law.correlation, size=count, method="cholesky")
+    normal = generator.multivariate_normal(
+        np.zeros(len(law.sd)), law.correlation, size=count, method="cholesky"
+    )
     z = normal * law.sd
     if np.all(np.isfinite(law.half)):
         z = np.log(gammaincinv(law.half, ndtr(normal)) / law.half) - law.bias
@@ -244,7 +292,9 @@ def drawn_log_residuals(part: PartResiduals, generator: np.random.Generator, cou
 
 def _drawn(objective: Residuals, scatter: np.ndarray, generator: np.random.Generator) -> Rows:
     """Data residuals of every part at the truth."""
-    drawn = generator.multivariate_normal(np.zeros(len(scatter)), scatter, size=REPLICATES, method="eigh")
+    drawn = generator.multivariate_normal(
+        np.zeros(len(scatter)), scatter, size=REPLICATES, method="eigh"
+    )
     start = 0
     for part in objective.parts:
         bins = len(part.statistics.sd)
@@ -265,14 +315,20 @@ def _rows_of(part: PartResiduals) -> int:
     return bins + part.data.further
 
 
-def _misfit(problem: FitProblem, objective: Residuals, residuals: np.ndarray, covariance: np.ndarray) -> str:
-    """In words, the run of neighbouring bins whose residuals have the largest sum in its standard errors.
+def _misfit(
+    problem: FitProblem, objective: Residuals, residuals: np.ndarray, covariance: np.ndarray
+) -> str:
+    """In words, the run of neighbouring bins whose residuals have the largest sum in its standard
+    errors.
 
     No bin in it is off by more than one standard deviation the other way.
     """
     if problem.residual == "cumulative":
         return ""
-    whose = {part.name: f"{part.name} has" if len(problem.parts) > 1 else "the data have" for part in problem.parts}
+    whose = {
+        part.name: f"{part.name} has" if len(problem.parts) > 1 else "the data have"
+        for part in problem.parts
+    }
     start, worst = 0, (0.0, "")
     for part, own in zip(problem.parts, objective.parts, strict=True):
         bins = _rows_of(own) - own.data.further
@@ -283,8 +339,13 @@ def _misfit(problem: FitProblem, objective: Residuals, residuals: np.ndarray, co
             off = np.sqrt(np.sum(each**2, axis=0))
             i = int(np.argmax(off))
             if off[i] > abs(worst[0]):
-                worst = off[i], (f"{whose[part.name]} another dynamic stiffness than the model at {points[i]:.2g} Hz "
-                                 f"({off[i]:.1f} standard errors)")  # fmt: skip
+                worst = (
+                    off[i],
+                    (
+                        f"{whose[part.name]} another dynamic stiffness than the model at"
+                        f" {points[i]:.2g} Hz ({off[i]:.1f} standard errors)"
+                    ),
+                )
         if not bins:
             continue
         size = np.concatenate([[0.0], np.cumsum(residuals[rows])])
@@ -294,22 +355,37 @@ def _misfit(problem: FitProblem, objective: Residuals, residuals: np.ndarray, co
         variance = corner[:, None] + corner[None] - 2 * spread
         first, last = np.triu_indices(bins + 1, 1)
         # A run that the fit has taken up has hardly any variance of its own.
-        ratio = (size[last] - size[first]) / np.sqrt(np.maximum(variance[first, last], 0.1 * (last - first)))
+        ratio = (size[last] - size[first]) / np.sqrt(
+            np.maximum(variance[first, last], 0.1 * (last - first))
+        )
         # Where a bin is clearly off the other way, the figure shows no such run.
-        mixed = [np.min(np.sign(x) * residuals[rows][a:b]) < -1.0 for x, a, b in zip(ratio, first, last, strict=True)]
+        mixed = [
+            np.min(np.sign(x) * residuals[rows][a:b]) < -1.0
+            for x, a, b in zip(ratio, first, last, strict=True)
+        ]
         ratio[mixed] = 0.0
         i = int(np.argmax(np.abs(ratio)))
         if abs(ratio[i]) > abs(worst[0]):
             low, high = part.target.frequency[first[i]], part.target.frequency[last[i] - 1]
-            place = f"at {low:.2g} Hz" if last[i] - first[i] == 1 else f"from {low:.2g} to {high:.2g} Hz"
+            place = (
+                f"at {low:.2g} Hz"
+                if last[i] - first[i] == 1
+                else f"from {low:.2g} to {high:.2g} Hz"
+            )
             more = "more" if ratio[i] > 0 else "less"
-            said = f"{whose[part.name]} {more} power than the model {place} ({abs(ratio[i]):.1f} standard errors)"
+            said = (
+                f"{whose[part.name]} {more} power than the model {place} ({abs(ratio[i]):.1f}"
+                " standard errors)"
+            )
             # What else the eye finds in the figure.
             apart = residuals[rows].copy()
             apart[first[i] : last[i]] = 0.0
             k = int(np.argmax(np.abs(apart)))
             largest = float(apart[k])
             if abs(largest) > ALONE:
-                said += f", and {'more' if largest > 0 else 'less'} at {part.target.frequency[k]:.2g} Hz"
+                said += (
+                    f", and {'more' if largest > 0 else 'less'} at"
+                    f" {part.target.frequency[k]:.2g} Hz"
+                )
             worst = ratio[i], said
     return worst[1]

@@ -1,4 +1,5 @@
-"""What is checked about a fit: nonlinear against linear, other minima, transients; and what is said about it."""
+"""What is checked about a fit: nonlinear against linear, other minima, transients; and what is said
+about it."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -25,16 +26,24 @@ from ._part import Estimate, FittedPart, Start, met
 
 AMBIGUOUS, OTHER = 2.0, 3.0
 PULLED = 3.0  # prior standard deviations
-CLEAR, EXTRAPOLATED = 4.0, 2.0  # standard errors of a response that is seen clearly; of the tangent stiffness
+# standard errors of a response that is seen clearly; of the tangent stiffness
+CLEAR, EXTRAPOLATED = 4.0, 2.0
 NONLINEAR = 0.1
 LEFT = 1e-3
 RISEN = 1.5
 TWITCH = (0.05, 0.11)  # s; its source stands in the row of activation_time in the parameter table
-SLOW = ("It also stands for other slow things: the nervous drive, the relaxation of the muscle, a low-pass filter of the "
-        "recording")  # fmt: skip
-BY_SIMULATION = "Check with a fit by simulation, of one target at a time (--method montecarlo, method='montecarlo')"
-FAST = ("The relaxation of the muscle smooths the force in the same way and may have taken its place. Or power at high "
-        "frequencies comes from elsewhere, as from the sensor")  # fmt: skip
+SLOW = (
+    "It also stands for other slow things: the nervous drive, the relaxation of the muscle, a"
+    " low-pass filter of the recording"
+)
+BY_SIMULATION = (
+    "Check with a fit by simulation, of one target at a time (--method montecarlo,"
+    " method='montecarlo')"
+)
+FAST = (
+    "The relaxation of the muscle smooths the force in the same way and may have taken its place."
+    " Or power at high frequencies comes from elsewhere, as from the sensor"
+)
 
 
 class Stage(NamedTuple):
@@ -46,10 +55,11 @@ class Stage(NamedTuple):
 
 
 def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Moments | None]:
-    """Moments of every seed, whose mean has the expectation of the nonlinear model, and those of the linear response.
+    """Moments of every seed, whose mean has the expectation of the nonlinear model, and those of
+    the linear response.
 
-    With a control variate a seed's power is `e + p_i - l_i` (see `Trajectory.mean_spectrum`), and so is its variance, e
-    being that of a recording as long as the target's.
+    With a control variate a seed's power is `e + p_i - l_i` (see `Trajectory.mean_spectrum`), and
+    so is its variance, e being that of a recording as long as the target's.
     """
     settings = target.settings
     held = runs.filtered(settings)
@@ -72,38 +82,61 @@ def seen_best(objective: Residuals, minima: Minima) -> Expansion:
     return expand(objective, np.asarray(objective.theta(minima.s))[[minima.best]]).row(0)
 
 
-def linear_check(each: np.ndarray, expected: np.ndarray, statistics: BinStatistics) -> dict[str, float | int]:
-    """How far the nonlinear spectrum is from the linear response, by fresh seeds with the control variate."""
+def linear_check(
+    each: np.ndarray, expected: np.ndarray, statistics: BinStatistics
+) -> dict[str, float | int]:
+    """How far the nonlinear spectrum is from the linear response, by fresh seeds with the control
+    variate."""
     difference = each.mean(axis=0) - expected
-    error = each.std(axis=0, ddof=1) / np.sqrt(len(each)) if len(each) > 1 else np.full(len(expected), np.nan)
+    error = (
+        each.std(axis=0, ddof=1) / np.sqrt(len(each))
+        if len(each) > 1
+        else np.full(len(expected), np.nan)
+    )
     relative = difference / expected
     return {
         "seeds": len(each),
         "largest_deviation_se": float(np.max(np.abs(difference) / error)),
         "largest_deviation": float(np.max(np.abs(relative))),
-        "largest_deviation_sd": float(np.max(np.abs(np.log1p(np.maximum(relative, -0.999)) / statistics.sd))),
+        "largest_deviation_sd": float(
+            np.max(np.abs(np.log1p(np.maximum(relative, -0.999)) / statistics.sd))
+        ),
     }
 
 
-def polish_check(problem: FitProblem, stages: list[Stage], found: dict[str, Estimate]) -> dict[str, float | int]:
+def polish_check(
+    problem: FitProblem, stages: list[Stage], found: dict[str, Estimate]
+) -> dict[str, float | int]:
     """How far the nonlinear correction moved the determined quantities, in standard errors."""
     names = [stage.name for stage in stages]
     if "polishing" not in names or problem.method != "linear":
         return {}
     before, after = stages[names.index("linear response")], stages[-1]
-    old, new = (problem.by_name(consequences(s.objective, seen_best(s.objective, s.minima)).values) for s in (before, after))
+    old, new = (
+        problem.by_name(consequences(s.objective, seen_best(s.objective, s.minima)).values)
+        for s in (before, after)
+    )
     # Of several targets, a quantity that is the same for all is that of the first.
     held = {name: name if name in new else f"{name}@{problem.parts[0].name}" for name in found}
-    moves = [abs(float(new[held[n]] - old[held[n]])) / p.stderr for n, p in found.items() if p.stderr]
-    return {"polish_moved_se": max(moves, default=0.0), "polish_turns": len(stages) - 1 - names.index("linear response")}
+    moves = [
+        abs(float(new[held[n]] - old[held[n]])) / p.stderr for n, p in found.items() if p.stderr
+    ]
+    return {
+        "polish_moved_se": max(moves, default=0.0),
+        "polish_turns": len(stages) - 1 - names.index("linear response"),
+    }
 
 
 def polish_notices(check: dict[str, float | int]) -> tuple[str, ...]:
     """The notice of a correction that matters."""
     if not check.get("polish_moved_se", 0.0) > 1:
         return ()
-    return (f"the correction by simulation moved a determined quantity by {check['polish_moved_se']:.1f} of its standard "
-            f"errors. {BY_SIMULATION}",)  # fmt: skip
+    return (
+        (
+            "the correction by simulation moved a determined quantity by"
+            f" {check['polish_moved_se']:.1f} of its standard errors. {BY_SIMULATION}"
+        ),
+    )
 
 
 def unsettled(problem: FitProblem, moments: Moments) -> float:
@@ -111,12 +144,16 @@ def unsettled(problem: FitProblem, moments: Moments) -> float:
     return float(np.exp(-float(moments.rate) * (WINDOW[0] - RISEN))) if problem.control else 0.0
 
 
-def rivals(problem: FitProblem, stage: Stage, stated: Mapping[str, Estimate]) -> tuple[tuple[str, ...], set[str]]:
-    """Other solutions that fit almost as well as the best one, told in words; and which stated quantities differ in them.
+def rivals(
+    problem: FitProblem, stage: Stage, stated: Mapping[str, Estimate]
+) -> tuple[tuple[str, ...], set[str]]:
+    """Other solutions that fit almost as well as the best one, told in words; and which stated
+    quantities differ in them.
 
-    Almost as well: a cost `½ Σ r²` within 2 of the lowest, so that a 95 % likelihood interval would contain them. Near a
-    single minimum no quantity is then further off than two standard errors; one that is further than three, or a
-    harmonic's frequency further than a bin, belongs to another solution.
+    Almost as well: a cost `½ Σ r²` within 2 of the lowest, so that a 95 % likelihood interval would
+    contain them. Near a single minimum no quantity is then further off than two standard errors;
+    one that is further than three, or a harmonic's frequency further than a bin, belongs to another
+    solution.
     """
     minima = stage.minima
     cost = np.where(np.isfinite(minima.cost), minima.cost, np.inf)
@@ -128,27 +165,53 @@ def rivals(problem: FitProblem, stage: Stage, stated: Mapping[str, Estimate]) ->
     told, moved = [], set[str]()
     frequency = {name: harmonic_frequencies(problem, theta, name)[chosen] for name in names}
     for i in range(1, len(chosen)):
-        differ = [n for n, f in frequency.items() if abs(f[i] - f[0]) >= problem.finest.settings.resolution]
-        told.append(" with ".join(f"{n} " * (len(names) > 1) + f"{frequency[n][i]:.2f} Hz" for n in differ))
+        differ = [
+            n
+            for n, f in frequency.items()
+            if abs(f[i] - f[0]) >= problem.finest.settings.resolution
+        ]
+        told.append(
+            " with ".join(f"{n} " * (len(names) > 1) + f"{frequency[n][i]:.2f} Hz" for n in differ)
+        )
         moved |= set(differ)
     said: tuple[str, ...] = ()
     if told:
         verb = "is" if len(moved) == 1 else "are"
-        others = " or ".join((", ".join(told[:-1]), told[-1])) + " fit" if told[1:] else f"{told[0]} fits"
-        said = (f"{' and '.join(sorted(moved))} {verb} ambiguous: {others} almost as well (log-likelihood lower by at most "
-                f"{AMBIGUOUS:g}). All other numbers are those of the frequency shown",)  # fmt: skip
+        others = (
+            " or ".join((", ".join(told[:-1]), told[-1])) + " fit"
+            if told[1:]
+            else f"{told[0]} fits"
+        )
+        said = (
+            (
+                f"{' and '.join(sorted(moved))} {verb} ambiguous: {others} almost as well"
+                f" (log-likelihood lower by at most {AMBIGUOUS:g}). All other numbers are those of"
+                " the frequency shown"
+            ),
+        )
     if not any(p.stderr for p in stated.values()) or not stage.objective.linear:
         return said, moved
-    rows = order[np.minimum(np.arange(BATCH), len(order) - 1)]  # one size, so that one program serves all
+    # one size, so that one program serves all
+    rows = order[np.minimum(np.arange(BATCH), len(order) - 1)]
     values = _values(problem, stage.objective, theta[rows])
-    far = {n: values[n][np.argmax(np.abs(values[n] - values[n][0]))] for n, p in stated.items()
-           if p.stderr and n in values and n not in moved
-           and np.max(np.abs(values[n] - values[n][0])) > OTHER * p.stderr}  # fmt: skip
+    far = {
+        n: values[n][np.argmax(np.abs(values[n] - values[n][0]))]
+        for n, p in stated.items()
+        if p.stderr
+        and n in values
+        and n not in moved
+        and np.max(np.abs(values[n] - values[n][0])) > OTHER * p.stderr
+    }
     if far:
         others = ", ".join(f"{n} {far[n]:.3g} instead of {values[n][0]:.3g}" for n in far)
         these, them = ("these quantities", "them") if len(far) > 1 else ("this quantity", "it")
-        said += (f"another solution fits almost as well (log-likelihood lower by at most {AMBIGUOUS:g}): {others}. No "
-                 f"standard error is stated for {these}. Treat {them} as not determined",)  # fmt: skip
+        said += (
+            (
+                "another solution fits almost as well (log-likelihood lower by at most"
+                f" {AMBIGUOUS:g}): {others}. No standard error is stated for {these}. Treat {them}"
+                " as not determined"
+            ),
+        )
     return said, moved | set(far)
 
 
@@ -156,7 +219,9 @@ def _values(problem: FitProblem, objective: Residuals, theta: np.ndarray) -> dic
     """Free parameters and derived quantities at every θ."""
     seen = expand(objective, theta)
     derived = problem.by_name(quantities(objective, seen)[0])
-    return derived | dict(zip(problem.coordinates.names, problem.coordinates.values_of(theta).T, strict=True))
+    return derived | dict(
+        zip(problem.coordinates.names, problem.coordinates.values_of(theta).T, strict=True)
+    )
 
 
 def convergence(
@@ -169,7 +234,8 @@ def convergence(
     starts: tuple[Start, ...],
     max_steps: int,
 ) -> tuple[bool, str]:
-    """Success: a further step gains less than a thousandth of the cost, or only runs along what is not determined."""
+    """Success: a further step gains less than a thousandth of the cost, or only runs along what is
+    not determined."""
     cost = final.cost[final.best]
     curvature = jacobian.T @ jacobian + np.diag(prior)
     gradient = jacobian.T @ residuals + prior * theta
@@ -184,19 +250,30 @@ def convergence(
     if along @ along >= 0.9 * (step @ step):
         return (
             True,
-            f"stopped after {max_steps} steps: further ones change only what the data do not determine; {census}",
+            (
+                f"stopped after {max_steps} steps: further ones change only what the data do not"
+                f" determine; {census}"
+            ),
         )
-    return False, (f"did not converge: after {max_steps} steps a further step would still improve the fit by "
-                   f"{100 * gain:.2g} %. Give more starts (--starts), or in Python raise max_steps")  # fmt: skip
+    return (
+        False,
+        (
+            f"did not converge: after {max_steps} steps a further step would still improve the fit"
+            f" by {100 * gain:.2g} %. Give more starts (--starts), or in Python raise max_steps"
+        ),
+    )
 
 
 def further_notices(further: Mapping[str, float]) -> tuple[str, ...]:
     """The notice of a datum that the fit misses."""
     words = {"coefficient_of_variation": "coefficient of variation", "mean": "mean"}
-    return tuple(f"the fitted {words[name]} is {abs(off):.1f} standard deviations {'above' if off > 0 else 'below'} the "
-                 "given one. The model cannot meet this value and the other data together: check how the value was "
-                 "measured" for name, off in further.items()
-                 if name not in met(further))  # fmt: skip
+    return tuple(
+        f"the fitted {words[name]} is {abs(off):.1f} standard deviations"
+        f" {'above' if off > 0 else 'below'} the given one. The model cannot meet this value and"
+        " the other data together: check how the value was measured"
+        for name, off in further.items()
+        if name not in met(further)
+    )
 
 
 def twitch_notices(found: Mapping[str, Estimate]) -> tuple[str, ...]:
@@ -210,27 +287,38 @@ def twitch_notices(found: Mapping[str, Estimate]) -> tuple[str, ...]:
         low, high = p.interval
         slow, fast = low is not None and low > TWITCH[1], high is not None and high < TWITCH[0]
         if slow or fast:
-            said.append(f"{name} ({p.interval_in_words()} s) is {'longer' if slow else 'shorter'} than in human muscle, "
-                        f"{TWITCH[0]:g} to {TWITCH[1]:g} s. {SLOW if slow else FAST}. Do not report it as the muscle's "
-                        f"contraction time. What to do: {instead}hold activation_time at a value that you know")  # fmt: skip
+            said.append(
+                f"{name} ({p.interval_in_words()} s) is {'longer' if slow else 'shorter'} than in"
+                f" human muscle, {TWITCH[0]:g} to {TWITCH[1]:g} s. {SLOW if slow else FAST}. Do not"
+                f" report it as the muscle's contraction time. What to do: {instead}hold"
+                " activation_time at a value that you know"
+            )
     return tuple(said)
 
 
 def mass_notices(coordinates: Coordinates, theta: Float[np.ndarray, " free"]) -> tuple[str, ...]:
     """The notice of an active mass that was pulled far from where its prior has it."""
     said = []
-    for name, at, centre, sd in zip(coordinates.names, theta, coordinates.centre, coordinates.sd, strict=True):
+    for name, at, centre, sd in zip(
+        coordinates.names, theta, coordinates.centre, coordinates.sd, strict=True
+    ):
         if base_of(name) == "m_w" and abs(at) > PULLED:
-            said.append(f"{name} went to {centre * np.exp(at * sd):.2g} kg, {abs(at):.2g} standard deviations of its prior "
-                        f"from the {centre:.2g} kg with which the fit began. No record determines it, so something else "
-                        "pulls it: the force may fluctuate in a way that this muscle cannot, or another mass moves. "
-                        "Then stiffness and damping may be wrong by more than their errors. Compare them with K and B of "
-                        "jaxmuscle analyse, which look at the response alone")  # fmt: skip
+            said.append(
+                f"{name} went to {centre * np.exp(at * sd):.2g} kg, {abs(at):.2g} standard"
+                f" deviations of its prior from the {centre:.2g} kg with which the fit began. No"
+                " record determines it, so something else pulls it: the force may fluctuate in a"
+                " way that this muscle cannot, or another mass moves. Then stiffness and damping"
+                " may be wrong by more than their errors. Compare them with K and B of jaxmuscle"
+                " analyse, which look at the response alone"
+            )
     return tuple(said)
 
 
-def reach_notices(found: Mapping[str, Estimate], parts: Mapping[str, FittedPart]) -> tuple[str, ...]:
-    """The notice of a tangent stiffness, H(0), that is not what was measured at the lowest frequency of the motion."""
+def reach_notices(
+    found: Mapping[str, Estimate], parts: Mapping[str, FittedPart]
+) -> tuple[str, ...]:
+    """The notice of a tangent stiffness, H(0), that is not what was measured at the lowest
+    frequency of the motion."""
     said = []
     for name, p in found.items():
         if base_of(name) != "tangent_stiffness" or p.stderr is None:
@@ -244,10 +332,12 @@ def reach_notices(found: Mapping[str, Estimate], parts: Mapping[str, FittedPart]
                 continue
             lowest, there = float(known.frequency[seen[0]]), float(np.real(part.stiffness[seen[0]]))
             if abs(there - p.value) > EXTRAPOLATED * p.stderr:
-                said.append(f"{name} ({p.value:.4g} N/m) is extrapolated: the motion tells little below {lowest:.2g} Hz, "
-                            f"where this muscle has {there:.4g} N/m. What it does at lower frequencies follows from the "
-                            f"fluctuations alone. What to do: report the stiffness at {lowest:.2g} Hz, or record once more "
-                            "with a slower motion")  # fmt: skip
+                said.append(
+                    f"{name} ({p.value:.4g} N/m) is extrapolated: the motion tells little below"
+                    f" {lowest:.2g} Hz, where this muscle has {there:.4g} N/m. What it does at"
+                    " lower frequencies follows from the fluctuations alone. What to do: report"
+                    f" the stiffness at {lowest:.2g} Hz, or record once more with a slower motion"
+                )
     return tuple(said)
 
 
@@ -257,14 +347,22 @@ def notices_of(
     """What has to be said of one target and its task."""
     notices = list(target.notices)
     if not statistics.known:
-        notices.append("the target states neither segments nor sigma, so every bin counts alike and there is no chi2")
+        notices.append(
+            "the target states neither segments nor sigma, so every bin counts alike and there is"
+            " no chi2"
+        )
     if check.get("largest_deviation", 0.0) > NONLINEAR:
         corrected = "corrected" if "polish_turns" in check else "not corrected"
-        notices.append(f"formula and simulation differ by up to {100 * check['largest_deviation']:.0f} % of a bin's power, "
-                       "so noise or harmonic are large here"
-                       + f". The fit is {corrected} for it. {BY_SIMULATION}" * (method == "linear"))  # fmt: skip
+        notices.append(
+            f"formula and simulation differ by up to {100 * check['largest_deviation']:.0f} % of a"
+            " bin's power, so noise or harmonic are large here"
+            + f". The fit is {corrected} for it. {BY_SIMULATION}"
+            * (method == "linear")
+        )
     if left > LEFT:
-        notices.append("slow muscle: when the analysed part of a simulation begins, "
-                       f"{100 * left:.1g} % of the start-up is still left. The fit assumes a settled muscle. To simulate "
-                       "that in Python, use jaxmuscle.settled(task)")  # fmt: skip
+        notices.append(
+            f"slow muscle: when the analysed part of a simulation begins, {100 * left:.1g} % of the"
+            " start-up is still left. The fit assumes a settled muscle. To simulate that in"
+            " Python, use jaxmuscle.settled(task)"
+        )
     return tuple(notices)

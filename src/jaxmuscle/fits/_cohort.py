@@ -36,12 +36,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-COLUMNS = ("target", "group", "quantity", "value", "stderr", "low", "high", "unit", "determined", "mvc_fraction",
-           "chi2_per_bin", "adequate", "adequacy_p", "success")  # fmt: skip
+COLUMNS = (
+    "target",
+    "group",
+    "quantity",
+    "value",
+    "stderr",
+    "low",
+    "high",
+    "unit",
+    "determined",
+    "mvc_fraction",
+    "chi2_per_bin",
+    "adequate",
+    "adequacy_p",
+    "success",
+)
 
 
 class CohortResult(Result, eqx.Module):
-    """`results` by target name; `groups`, the group of each (empty without); `failed`, why others were not fitted."""
+    """`results` by target name; `groups`, the group of each (empty without); `failed`, why others
+    were not fitted."""
 
     results: dict[str, FitResult]
     groups: dict[str, str]
@@ -55,50 +70,92 @@ class CohortResult(Result, eqx.Module):
     @property
     def verdict(self) -> str:
         """How many of the fits describe their data, and which do not."""
-        judged = {name: result.adequate for name, result in self.results.items() if result.adequate is not None}
+        judged = {
+            name: result.adequate
+            for name, result in self.results.items()
+            if result.adequate is not None
+        }
         if not judged and not any(result.success for result in self.results.values()):
             return "no target could be fitted"
         if not judged:
-            return ("whether the model describes the targets cannot be judged: they state neither segments nor sigma "
-                    "(--segments)")  # fmt: skip
+            return (
+                "whether the model describes the targets cannot be judged: they state neither"
+                " segments nor sigma (--segments)"
+            )
         bad = [name for name, adequate in judged.items() if not adequate]
         said = f"the model describes {len(judged) - len(bad)} of {len(judged)} targets"
-        return said + (f"; it does not describe {', '.join(bad)}, whose errors are widened" if bad else "")
+        return said + (
+            f"; it does not describe {', '.join(bad)}, whose errors are widened" if bad else ""
+        )
 
     def _card(self) -> Card:
         columns = ("target", "group", "in words")
-        rows = [(name, self.groups.get(name, ""), result.verdict) for name, result in self.results.items()]
-        rows += [(name, self.groups.get(name, ""), f"not fitted: {why}") for name, why in self.failed.items()]
+        rows = [
+            (name, self.groups.get(name, ""), result.verdict)
+            for name, result in self.results.items()
+        ]
+        rows += [
+            (name, self.groups.get(name, ""), f"not fitted: {why}")
+            for name, why in self.failed.items()
+        ]
         heading = f"{len(rows)} targets: {self.verdict}"
-        return Card("\n".join([folded([heading]), *in_columns(columns, rows)]), heading, columns, tuple(rows))
+        return Card(
+            "\n".join([folded([heading]), *in_columns(columns, rows)]),
+            heading,
+            columns,
+            tuple(rows),
+        )
 
     def table(self) -> list[dict[str, Any]]:
-        """Tidy rows, one per target and quantity (free parameters, then derived ones), with the columns
-        that *Results as numbers* lists (docs/reference/index.md).
+        """Tidy rows, one per target and quantity (free parameters, then derived ones), with the
+        columns that *Results as numbers* lists (docs/reference/index.md).
 
         `low` and `high` are the ends of the 95 % interval.
         """
         return [
-            dict(zip(COLUMNS, (name, self.groups.get(name, ""), quantity, e.value, e.stderr, *_ends(e), e.unit,
-                               e.identifiable, result.target.mvc_fraction, result.chi2_per_bin, result.adequate,
-                               result.adequacy_p, result.success), strict=True))
+            dict(
+                zip(
+                    COLUMNS,
+                    (
+                        name,
+                        self.groups.get(name, ""),
+                        quantity,
+                        e.value,
+                        e.stderr,
+                        *_ends(e),
+                        e.unit,
+                        e.identifiable,
+                        result.target.mvc_fraction,
+                        result.chi2_per_bin,
+                        result.adequate,
+                        result.adequacy_p,
+                        result.success,
+                    ),
+                    strict=True,
+                )
+            )
             for name, result in self.results.items()
             for quantity, e in _quantities(result).items()
-        ]  # fmt: skip
+        ]
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """The rows of `table`."""
         return frame(self.table())
 
     def to_xarray(self) -> "xarray.Dataset":
-        """`value`, `stderr`, `low`, `high` (NaN where there is none) and `determined` over (target, quantity).
+        """`value`, `stderr`, `low`, `high` (NaN where there is none) and `determined` over (target,
+        quantity).
 
         `low` and `high` are the ends of the 95 % interval; units are a coordinate.
         """
         import xarray
 
-        names = list(dict.fromkeys(q for result in self.results.values() for q in _quantities(result)))
-        units = {q: e.unit for result in self.results.values() for q, e in _quantities(result).items()}
+        names = list(
+            dict.fromkeys(q for result in self.results.values() for q in _quantities(result))
+        )
+        units = {
+            q: e.unit for result in self.results.values() for q, e in _quantities(result).items()
+        }
 
         def grid(read: Callable[[Any], Any], missing: Any) -> list[list[Any]]:
             tables = [_quantities(result) for result in self.results.values()]
@@ -122,7 +179,10 @@ class CohortResult(Result, eqx.Module):
                 "quantity": names,
                 "unit": ("quantity", [units[q] for q in names]),
                 "group": ("target", [self.groups.get(name, "") for name in self.results]),
-                "mvc_fraction": ("target", [_or_nan(result.target.mvc_fraction) for result in results]),
+                "mvc_fraction": (
+                    "target",
+                    [_or_nan(result.target.mvc_fraction) for result in results],
+                ),
             },
             attrs={f"version_{package}": number for package, number in versions().items()},
         )
@@ -134,7 +194,9 @@ class CohortResult(Result, eqx.Module):
         """
         found = []
         groups = list(dict.fromkeys(self.groups.get(name, "") for name in self.results))
-        for quantity in dict.fromkeys(q for result in self.results.values() for q in _determined(result)):
+        for quantity in dict.fromkeys(
+            q for result in self.results.values() for q in _determined(result)
+        ):
             for a, b in itertools.combinations(groups, 2):
                 left, right = self._members(quantity, a), self._members(quantity, b)
                 if left and right:
@@ -142,11 +204,15 @@ class CohortResult(Result, eqx.Module):
         return tuple(found)
 
     def _members(self, quantity: str, group: str) -> list[Any]:
-        return [_determined(result)[quantity] for name, result in self.results.items()
-                if self.groups.get(name, "") == group and quantity in _determined(result)]  # fmt: skip
+        return [
+            _determined(result)[quantity]
+            for name, result in self.results.items()
+            if self.groups.get(name, "") == group and quantity in _determined(result)
+        ]
 
     def plot(self, by: str = "person", ax: "Axes | None" = None) -> "Figure | SubFigure":
-        """Determined quantities with their standard errors, by "person", "group" or "level" (fraction of MVC)."""
+        """Determined quantities with their standard errors, by "person", "group" or "level"
+        (fraction of MVC)."""
         return plot.cohort(self, by, ax)
 
 
@@ -160,7 +226,8 @@ def _ends(estimate: Estimate) -> tuple[float | None, float | None]:
 
 
 def _quantities(result: FitResult) -> dict[str, Any]:
-    """Free parameters and derived quantities, as they are shown; what is both (the tremor's frequency) once."""
+    """Free parameters and derived quantities, as they are shown; what is both (the tremor's
+    frequency) once."""
     return result.as_shown(result.found)
 
 
@@ -188,35 +255,50 @@ def fit_cohort(
 ) -> CohortResult:
     """Fit many targets, in linear response, all starts of all of them in one batch.
 
-        targets = [jm.load_target(name) for name in ("vastus-lateralis-26mvc", "fdi-abduction-45mvc")]
+        names = "vastus-lateralis-26mvc", "fdi-abduction-45mvc"
+        targets = [jm.load_target(name) for name in names]
         jm.fit_cohort(targets).to_dataframe()
 
-    As `fit` with `method="linear"` for each, without its last steps: no nonlinear correction (which usually changes a bin
-    by 0.2 %), no check on simulated seeds, no profile over the harmonic's frequency; fit a target alone for those. Targets
-    that can share a batch are those of the same task, bins and settings.
+    As `fit` with `method="linear"` for each, without its last steps: no nonlinear correction (which
+    usually changes a bin by 0.2 %), no check on simulated seeds, no profile over the harmonic's
+    frequency; fit a target alone for those. Targets that can share a batch are those of the same
+    task, bins and settings.
 
     **Arguments:**
 
     - `targets`: one of each person, in any form that `fit` takes (a list is the trials of one)
     - `groups` {target name: group}
     - `task`: the same kind for all (by default what each measured)
-    - `noise`, `fix`, `free`, `residual`, `bounds`, `priors`, `key`, `max_steps`, `coefficient_of_variation`: as in `fit`
+    - `noise`, `fix`, `free`, `residual`, `bounds`, `priors`, `key`, `max_steps`,
+      `coefficient_of_variation`: as in `fit`
     - `starts` for each target
-    - `rung`: the model of all of them (`on_rung`: 0 the base model, 1 with activation, 2 with tremor, 3 with a second
-      resonance), so that their numbers can be compared
+    - `rung`: the model of all of them (`on_rung`: 0 the base model, 1 with activation, 2 with
+      tremor, 3 with a second resonance), so that their numbers can be compared
     - `progress`: True or a function of (text, share)
 
-    **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these options, is
-    listed in `failed` with the reason and does not stop the rest.
+    **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these
+    options, is listed in `failed` with the reason and does not stop the rest.
 
     **Raises:** `ValueError` for no targets, equal names and a group of an unknown target.
     """
     loaded, failed = _loaded(targets, on_rung(PrescribedLength(), rung) if rung else None)
     unknown = set(groups or {}) - set(loaded) - set(failed)
     if unknown:
-        raise ValueError(f"groups: no target is called {', '.join(sorted(unknown))}; there are {', '.join(loaded)}")
-    options = FitOptions(free=free, fix=fix, residual=residual, starts=starts, key=key, bounds=bounds, priors=priors,
-                         coefficient_of_variation=coefficient_of_variation, max_steps=max_steps)  # fmt: skip
+        raise ValueError(
+            f"groups: no target is called {', '.join(sorted(unknown))}; there are"
+            f" {', '.join(loaded)}"
+        )
+    options = FitOptions(
+        free=free,
+        fix=fix,
+        residual=residual,
+        starts=starts,
+        key=key,
+        bounds=bounds,
+        priors=priors,
+        coefficient_of_variation=coefficient_of_variation,
+        max_steps=max_steps,
+    )
     results: dict[str, FitResult] = {}
     with told(progress, f"fitting {len(loaded)} targets") as tell, fitting():
         batches: dict[Any, dict[str, Plan]] = {}
@@ -232,12 +314,16 @@ def fit_cohort(
         for batch in batches.values():
             results |= zip(batch, search_together(list(batch.values()), tell, rung), strict=True)
     ordered = {name: results[name] for name in loaded if name in results}
-    return CohortResult(ordered, {name: (groups or {})[name] for name in ordered if name in (groups or {})}, failed)
+    return CohortResult(
+        ordered, {name: (groups or {})[name] for name in ordered if name in (groups or {})}, failed
+    )
 
 
-def _loaded(targets: Iterable[Any], moved: AbstractTask | None) -> tuple[dict[str, Target], dict[str, str]]:
-    """Targets by name, and why others could not be read; `moved`, the model by which a moved record's response is taken
-    off."""
+def _loaded(
+    targets: Iterable[Any], moved: AbstractTask | None
+) -> tuple[dict[str, Target], dict[str, str]]:
+    """Targets by name, and why others could not be read; `moved`, the model by which a moved
+    record's response is taken off."""
     loaded: dict[str, Target] = {}
     failed: dict[str, str] = {}
     for given in targets:
@@ -255,7 +341,8 @@ def _loaded(targets: Iterable[Any], moved: AbstractTask | None) -> tuple[dict[st
 
 
 def _alike(plan: Plan) -> Any:
-    """Equal for fits that differ in their data only, and in the length of their recordings by less than a half."""
+    """Equal for fits that differ in their data only, and in the length of their recordings by less
+    than a half."""
     (part,) = plan.problem.parts
     target, task = part.target, part.task
     length = round(2 * np.log2(trial_samples(target)))

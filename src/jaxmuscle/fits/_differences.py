@@ -1,4 +1,5 @@
-"""Differences between groups and between conditions, their intervals and p-values, corrected for many comparisons."""
+"""Differences between groups and between conditions, their intervals and p-values, corrected for
+many comparisons."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,18 +17,21 @@ CORRECTIONS = ("holm", "fdr", "none")
 
 
 class Difference(eqx.Module):
-    """Mean of `quantity` in group `b` minus that in group `a`, the `difference`, with its interval (`low`, `high`).
+    """Mean of `quantity` in group `b` minus that in group `a`, the `difference`, with its interval
+    (`low`, `high`).
 
     The interval holds 95 %, or 1 - alpha in a study.
 
-    All in `unit`; `members` is how many the groups have; `p`, how often chance alone would give as much.
-    `basis` says what interval and p stand on: "people", the spread within the groups (Welch's t; the fits' own errors are
-    part of that spread), or "fits", the standard errors of the fits, where a group has one member only.
+    All in `unit`; `members` is how many the groups have; `p`, how often chance alone would give as
+    much. `basis` says what interval and p stand on: "people", the spread within the groups (Welch's
+    t; the fits' own errors are part of that spread), or "fits", the standard errors of the fits,
+    where a group has one member only.
 
-    In a study also: `kind`, "groups" (at `where`, a condition), "conditions" (`b` minus `a` within people) or "interaction"
-    (the change between two conditions in group `b` minus that in group `a`; with `where` "tired - rest" the change is the
-    value in tired minus that in rest); `p_corrected` for all comparisons of
-    that kind; `left_out`, people whose fits do not determine the quantity.
+    In a study also: `kind`, "groups" (at `where`, a condition), "conditions" (`b` minus `a` within
+    people) or "interaction" (the change between two conditions in group `b` minus that in group
+    `a`; with `where` "tired - rest" the change is the value in tired minus that in rest);
+    `p_corrected` for all comparisons of that kind; `left_out`, people whose fits do not determine
+    the quantity.
     """
 
     quantity: str
@@ -47,43 +51,76 @@ class Difference(eqx.Module):
 
 
 def difference(
-    quantity: str, a: tuple[str, Sequence[Estimate]], b: tuple[str, Sequence[Estimate]], confidence: float = CONFIDENCE
+    quantity: str,
+    a: tuple[str, Sequence[Estimate]],
+    b: tuple[str, Sequence[Estimate]],
+    confidence: float = CONFIDENCE,
 ) -> Difference:
-    """Of the means of two groups of people, by Welch's t; by the fits' standard errors where one has a single member."""
+    """Of the means of two groups of people, by Welch's t; by the fits' standard errors where one
+    has a single member."""
     left, right = ([e.value for e in members] for _, members in (a, b))
     middle = float(np.mean(right) - np.mean(left))
     if len(left) > 1 and len(right) > 1:
         test = scipy.stats.ttest_ind(right, left, equal_var=False)
         interval, p, basis = test.confidence_interval(confidence), test.pvalue, "people"
     else:
-        parts = [sum((e.stderr or 0.0) ** 2 for e in members) / len(members) ** 2 for _, members in (a, b)]
+        parts = [
+            sum((e.stderr or 0.0) ** 2 for e in members) / len(members) ** 2
+            for _, members in (a, b)
+        ]
         law = scipy.stats.norm(middle, np.sqrt(sum(parts)))
         low, high = law.interval(confidence)
         interval, p, basis = (low, high), 2 * min(law.cdf(0.0), law.sf(0.0)), "fits"
     low, high = map(float, interval)
-    return Difference(quantity, a[0], b[0], middle, low, high, a[1][0].unit, basis, (len(left), len(right)), float(p))
+    return Difference(
+        quantity,
+        a[0],
+        b[0],
+        middle,
+        low,
+        high,
+        a[1][0].unit,
+        basis,
+        (len(left), len(right)),
+        float(p),
+    )
 
 
-def paired(quantity: str, a: str, b: str, changes: Sequence[Estimate], confidence: float = CONFIDENCE) -> Difference:
+def paired(
+    quantity: str, a: str, b: str, changes: Sequence[Estimate], confidence: float = CONFIDENCE
+) -> Difference:
     """Of two conditions, from every person's change from `a` to `b`, by the paired t."""
     values = [change.value for change in changes]
     test = scipy.stats.ttest_1samp(values, 0.0)
     low, high = map(float, test.confidence_interval(confidence))
     members = len(values), len(values)
-    return Difference(quantity, a, b, float(np.mean(values)), low, high, changes[0].unit, "people", members,
-                      float(test.pvalue), "conditions")  # fmt: skip
+    return Difference(
+        quantity,
+        a,
+        b,
+        float(np.mean(values)),
+        low,
+        high,
+        changes[0].unit,
+        "people",
+        members,
+        float(test.pvalue),
+        "conditions",
+    )
 
 
 def change(a: Estimate, b: Estimate) -> Estimate:
-    """What one person's quantity does from one condition to the other, the fits' errors taken as independent."""
+    """What one person's quantity does from one condition to the other, the fits' errors taken as
+    independent."""
     return Estimate(b.value - a.value, a.unit, float(np.hypot(a.stderr or 0.0, b.stderr or 0.0)))
 
 
 def corrected(family: Sequence[Difference], correction: str) -> list[Difference]:
     """The same comparisons with `p_corrected` for all of them together.
 
-    "holm" bounds the chance of any false positive (Holm 1979, Scand J Stat 6:65-70), "fdr" the expected share of false
-    among the positive ones (Benjamini & Hochberg 1995, J R Stat Soc B 57:289-300), "none" nothing.
+    "holm" bounds the chance of any false positive (Holm 1979, Scand J Stat 6:65-70), "fdr" the
+    expected share of false among the positive ones (Benjamini & Hochberg 1995, J R Stat Soc B
+    57:289-300), "none" nothing.
 
     **Raises:** `ValueError` for another `correction`.
     """
@@ -98,4 +135,7 @@ def corrected(family: Sequence[Difference], correction: str) -> list[Difference]
         p[order] = np.minimum(steps, 1.0)
     elif correction == "fdr":
         p = scipy.stats.false_discovery_control(p)
-    return [dataclasses.replace(each, p_corrected=float(value)) for each, value in zip(family, p, strict=True)]
+    return [
+        dataclasses.replace(each, p_corrected=float(value))
+        for each, value in zip(family, p, strict=True)
+    ]

@@ -48,80 +48,100 @@ def fit(
     increments: str = "gaussian",
     answer: Callable[[FitResult], None] | None = None,
 ) -> FitResult:
-    """Find the parameters whose expected spectrum is the target's: Levenberg-Marquardt from many starts.
+    """Find the parameters whose expected spectrum is the target's: Levenberg-Marquardt from many
+    starts.
 
         target = jm.load_target("vastus-lateralis-26mvc")
         result = jm.fit(jm.task_for(target), target)
         print(result)
 
-    Minimises `½ Σ r_k² + ½ Σ θ_j²`, r the residuals in standard deviations of the target (log residual:
-    `(z_k - z̄) / sd_k`, `z_k = ln(target_k / fitted_k) - bias_k`), θ the free parameters' distance from the task's own
-    values in standard deviations of the prior.
+    Minimises `½ Σ r_k² + ½ Σ θ_j²`, r the residuals in standard deviations of the target (log
+    residual: `(z_k - z̄) / sd_k`, `z_k = ln(target_k / fitted_k) - bias_k`), θ the free parameters'
+    distance from the task's own values in standard deviations of the prior.
 
-    `method="linear"`: the model's spectrum is that of the linear response (`expected_spectrum`); the best minimum is then
-    polished with the nonlinear model's correction to it, from `seeds` noise paths. `method="montecarlo"`: a mean over
-    `seeds` noise paths that stay the same throughout (common random numbers), with the linear response as control variate
-    where the task has one. The reported spectrum comes from `check_seeds` fresh paths of the nonlinear model.
+    `method="linear"`: the model's spectrum is that of the linear response (`expected_spectrum`);
+    the best minimum is then polished with the nonlinear model's correction to it, from `seeds`
+    noise paths. `method="montecarlo"`: a mean over `seeds` noise paths that stay the same
+    throughout (common random numbers), with the linear response as control variate where the task
+    has one. The reported spectrum comes from `check_seeds` fresh paths of the nonlinear model.
 
     **Arguments:**
 
     - `task`: the model; its values are the prior's centre. `task_for(target)` makes one
-    - `target`: what is fitted; its spectrum settings replace the task's. A `Target`, a `Recording`, the recordings of one
-      condition (a list, `Trials`), a `PerturbedRecording` or several, a `FrequencyResponse`, or names and paths of these
-      (with a `PrescribedLength` a file of force and displacement is a perturbed recording, see
-      `jaxmuscle.data.two_channels`)
-    - `free`: names to fit. By default those marked ● in the table of parameters (docs/reference/parameters.md), and, if
-      the task has them, the correlation time of its noise, the contraction time, and amplitude, frequency and width of its
-      tremor and of its second resonance; where a motor moves the insertion m_w and m_z, too. Of a target without
-      a spectrum only k_w, k_z, c_w, c_z, m_w and m_z
+    - `target`: what is fitted; its spectrum settings replace the task's. A `Target`, a `Recording`,
+      the recordings of one condition (a list, `Trials`), a `PerturbedRecording` or several, a
+      `FrequencyResponse`, or names and paths of these (with a `PrescribedLength` a file of force
+      and displacement is a perturbed recording, see `jaxmuscle.data.two_channels`)
+    - `free`: names to fit. By default those marked ● in the table of parameters
+      (docs/reference/parameters.md), and, if the task has them, the correlation time of its noise,
+      the contraction time, and amplitude, frequency and width of its tremor and of its second
+      resonance; where a motor moves the insertion m_w and m_z, too. Of a target without a spectrum
+      only k_w, k_z, c_w, c_z, m_w and m_z
     - `fix`: values to set, which are then not free
     - `noise`: a name or an object
     - `residual`: "log", "linear" or "cumulative"
-    - `starts`: from how many points the search starts (100, or 8 for a task without linear response)
-    - `seeds`: noise paths of the nonlinear correction (32, or 48 for a task without linear response; 0: no nonlinear
-      correction)
+    - `starts`: from how many points the search starts (100, or 8 for a task without linear
+      response)
+    - `seeds`: noise paths of the nonlinear correction (32, or 48 for a task without linear
+      response; 0: no nonlinear correction)
     - `key`: a `jax.random` key or a seed number
     - `bounds` {name: (low, high)} in the unit of the parameter; infinite where there is none
     - `priors` {name: sd in log, or None for a flat one}
-    - `coefficient_of_variation`: whether the target's, if it states one, is one more residual (it fixes the scale of the
-      noise)
-    - `mean_force` (value, sd) [N] as a further residual, of a task that you have scaled (`at_force`) and whose P_w you free.
-      By default, if the target states its mean in newtons, that mean: then the task is scaled to it, and P_w is free.
-      False: no mean is used
+    - `coefficient_of_variation`: whether the target's, if it states one, is one more residual (it
+      fixes the scale of the noise)
+    - `mean_force` (value, sd) [N] as a further residual, of a task that you have scaled
+      (`at_force`) and whose P_w you free. By default, if the target states its mean in newtons,
+      that mean: then the task is scaled to it, and P_w is free. False: no mean is used
     - `max_steps` of each search from a starting point
-    - `check_seeds`: fresh noise paths of the reported spectrum (64; 200 for a task without linear response; 0: not
-      simulated)
+    - `check_seeds`: fresh noise paths of the reported spectrum (64; 200 for a task without linear
+      response; 0: not simulated)
     - `dt` [s]: noise grid of a Monte Carlo fit
     - `progress`: True or a function of (text, share)
-    - `rungs`: how many richer models may be tried where the base model does not describe the data (`on_rung`; 3, or 0 where
-      `noise` or `free` is given)
-    - `optimiser`: what makes the steps instead of `optimistix.LevenbergMarquardt`: another of optimistix's Gauss-Newton
-      solvers, `optimistix.Dogleg(1e-9, 1e-9)` say (for others there is `problem`)
-    - `increments`: "weak" for the faster random numbers of `ensemble` in all that is simulated here, of which only means
-      over the seeds are taken
-    - `answer`: a function that gets the result as soon as the search ends: with the verdict, before the simulated
-      check, and before profile and p-value of the harmonic
+    - `rungs`: how many richer models may be tried where the base model does not describe the data
+      (`on_rung`; 3, or 0 where `noise` or `free` is given)
+    - `optimiser`: what makes the steps instead of `optimistix.LevenbergMarquardt`: another of
+      optimistix's Gauss-Newton solvers, `optimistix.Dogleg(1e-9, 1e-9)` say (for others there is
+      `problem`)
+    - `increments`: "weak" for the faster random numbers of `ensemble` in all that is simulated
+      here, of which only means over the seeds are taken
+    - `answer`: a function that gets the result as soon as the search ends: with the verdict, before
+      the simulated check, and before profile and p-value of the harmonic
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
 
-    **Raises:** `ValueError` for bad arguments (unknown names with the nearest known, too few bins, values outside
-    bounds); `FitInterrupted` on Ctrl-C, with what was reached.
+    **Raises:** `ValueError` for bad arguments (unknown names with the nearest known, too few bins,
+    values outside bounds); `FitInterrupted` on Ctrl-C, with what was reached.
     """
     require_task(task, "fit(task, target)")
     require(
         all_concrete(task),
-        "task: JAX is tracing it (inside jit, grad or vmap), but a fit needs numbers. Call fit outside; "
-        "jaxmuscle.problem(task, target) has functions that JAX can transform (log_density, residuals)",
+        "task: JAX is tracing it (inside jit, grad or vmap), but a fit needs numbers. Call fit"
+        " outside; jaxmuscle.problem(task, target) has functions that JAX can transform"
+        " (log_density, residuals)",
     )
     recordings = recordings_of(target, task)
     aim = recordings[0].name if recordings else (target := as_target(target)).name
     with told(progress, f"fitting {aim}") as tell, fitting():
         options = FitOptions(
-            free=free, fix=fix, method=method, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds,
-            key=key, bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
-            mean_force=mean_force, max_steps=max_steps, dt=dt, progress=tell, rungs=rungs,
-            optimiser=optimiser, increments=increments,
-        )  # fmt: skip
+            free=free,
+            fix=fix,
+            method=method,
+            residual=residual,
+            starts=starts,
+            seeds=seeds,
+            check_seeds=check_seeds,
+            key=key,
+            bounds=bounds,
+            priors=priors,
+            coefficient_of_variation=coefficient_of_variation,
+            mean_force=mean_force,
+            max_steps=max_steps,
+            dt=dt,
+            progress=tell,
+            rungs=rungs,
+            optimiser=optimiser,
+            increments=increments,
+        )
         task = with_noise(task, noise, fix)
         if recordings:
             tell("subtracting the response to the movement", 0.01)
@@ -132,39 +152,57 @@ def fit(
 
 
 def _models(
-    task: AbstractTask, target: Target, given: FitOptions, top: int, recordings: tuple[PerturbedRecording, ...]
+    task: AbstractTask,
+    target: Target,
+    given: FitOptions,
+    top: int,
+    recordings: tuple[PerturbedRecording, ...],
 ) -> tuple[Plan, Models]:
     """The fit of the first model, and the richer ones that may follow."""
     base, options = at_mean(task, target, given)
-    unknown = len(target.bins) > 0 and target.segments is None and target.sigma is None  # no verdict
+    # no verdict
+    unknown = len(target.bins) > 0 and target.segments is None and target.sigma is None
     first = base if target.stiffness is None or unknown else without_rhythm(base, options)
 
     def plan_of(task: AbstractTask) -> Plan:
         return planned(task, target, options_for(task, options))
 
     def renewed(muscles: tuple[AbstractTask, ...]) -> tuple[Plan, Models] | None:
-        """The response was taken off by a muscle of the base model: where that is not chosen, by the one that is."""
+        """The response was taken off by a muscle of the base model: where that is not chosen, by
+        the one that is."""
         given.progress(ANEW, 0.0)
         again = seen_with(muscles[0], recordings)
         return None if alike(target, again) else _models(task, again, given, top, recordings)
 
     lowest = 0 if first is base else QUIET
     models = Models(
-        top, lambda number: plan_of(on_rung(base, number)), lowest, base, plan_of, renewed if recordings else None
+        top,
+        lambda number: plan_of(on_rung(base, number)),
+        lowest,
+        base,
+        plan_of,
+        renewed if recordings else None,
     )
     return plan_of(first), models
 
 
 def _top(task: AbstractTask, target: Target, options: FitOptions, *, chosen: bool) -> int:
-    """The highest rung of the ladder that may be tried: all of them, unless a model was asked for."""
-    possible = (options.method == "linear" and options.residual == "log" and is_base(task)
-                and (target.segments is not None or target.sigma is not None))  # fmt: skip
+    """The highest rung of the ladder that may be tried: all of them, unless a model was asked
+    for."""
+    possible = (
+        options.method == "linear"
+        and options.residual == "log"
+        and is_base(task)
+        and (target.segments is not None or target.sigma is not None)
+    )
     if options.rungs is None:
         asked = chosen or options.free is not None or type(task.noise) is not BandLimitedNoise
         return len(RUNGS) - 1 if possible and not asked else 0
     if options.rungs >= len(RUNGS):
         raise ValueError(f"rungs = {options.rungs}: the highest is {len(RUNGS) - 1}")
     if options.rungs and not possible:
-        raise ValueError("rungs: richer models can be tried only if the method is 'linear', the residual 'log', the target "
-                         "states segments or sigma, and the task has no activation or resonance yet")  # fmt: skip
+        raise ValueError(
+            "rungs: richer models can be tried only if the method is 'linear', the residual 'log',"
+            " the target states segments or sigma, and the task has no activation or resonance yet"
+        )
     return options.rungs

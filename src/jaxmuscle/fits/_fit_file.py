@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from ._result import FitResult
 
 FORMAT = 4
-FORMATS = (2, 3, 4)  # that can be read; 2 may leave out what task and target do not have, 3 where starts ended
+# that can be read; 2 may leave out what task and target do not have, 3 where starts ended
+FORMATS = (2, 3, 4)
 SAME = 1e-9  # relative
 
 Number = float | None  # null where it is not finite
@@ -30,29 +31,50 @@ class EstimateTable(Table, kw_only=True):
 
     value: Annotated[Number, says("Its value, null where there is none")]
     unit: Annotated[str, says("Its unit, 1 for a ratio")]
-    stderr: Annotated[Annotated[float, Meta(ge=0)] | None, says("Standard error, null where the data do not determine it")]
+    stderr: Annotated[
+        Annotated[float, Meta(ge=0)] | None,
+        says("Standard error, null where the data do not determine it"),
+    ]
     free: Annotated[bool, says("Whether it was fitted")]
-    identifiable: Annotated[bool | None, says("Whether the data determine it, null of what was fixed")]
-    interval: Annotated[tuple[Number, Number] | None, says("95 % interval, an end null where it is open")]
+    identifiable: Annotated[
+        bool | None, says("Whether the data determine it, null of what was fixed")
+    ]
+    interval: Annotated[
+        tuple[Number, Number] | None, says("95 % interval, an end null where it is open")
+    ]
 
 
 class AdequacyTable(Table, kw_only=True):
     """Whether the model describes the data: `adequacy`."""
 
-    chi2: Annotated[float, says("Chi² of the verdict: the sum of the squared residuals of all data")]
+    chi2: Annotated[
+        float, says("Chi² of the verdict: the sum of the squared residuals of all data")
+    ]
     expected: Annotated[float, says("Mean of that sum if the model is right")]
     p: Annotated[Share, says("p-value: share of the model's own data with a larger chi²")]
-    misfit: Annotated[str, says("Where the data lie furthest from the model, if it does not describe them; else empty")]
+    misfit: Annotated[
+        str,
+        says(
+            "Where the data lie furthest from the model, if it does not describe them; else empty"
+        ),
+    ]
 
 
 class RungTable(Table, kw_only=True):
     """A model that was tried: an entry of `ladder`."""
 
-    number: Annotated[Annotated[int, Meta(ge=-1)], says("-1 noise alone, 0 base, 1 activation, 2 tremor, 3 resonance")]
+    number: Annotated[
+        Annotated[int, Meta(ge=-1)],
+        says("-1 noise alone, 0 base, 1 activation, 2 tremor, 3 resonance"),
+    ]
     model: Annotated[str, says("The model in words")]
     aic: Annotated[float, says("-2 ln L + 2 parameters")]
-    parameters: Annotated[float, says("Effective number of parameters: less for one that the prior determines")]
-    chi2_per_bin: Annotated[float, says("Chi² of the verdict on this model, divided by bins less one")]
+    parameters: Annotated[
+        float, says("Effective number of parameters: less for one that the prior determines")
+    ]
+    chi2_per_bin: Annotated[
+        float, says("Chi² of the verdict on this model, divided by bins less one")
+    ]
     p: Annotated[Share, says("p-value of the verdict on this model")]
     chosen: Annotated[bool, says("Whether this model was chosen")]
 
@@ -60,8 +82,12 @@ class RungTable(Table, kw_only=True):
 class StartTable(Table, kw_only=True):
     """A start of the search: an entry of `starts`."""
 
-    cost: Annotated[Number, says("Cost where it ended: half the sum of squares, that of the prior included")]
-    success: Annotated[bool, says("Whether its last step lowered the cost by less than a thousandth of it")]
+    cost: Annotated[
+        Number, says("Cost where it ended: half the sum of squares, that of the prior included")
+    ]
+    success: Annotated[
+        bool, says("Whether its last step lowered the cost by less than a thousandth of it")
+    ]
     steps: Annotated[Count, says("Steps taken")]
     values: Annotated[
         tuple[float, ...],
@@ -73,14 +99,16 @@ class StartTable(Table, kw_only=True):
 
 
 class CorrelationTable(Table, kw_only=True):
-    """Correlations of the free parameters: `correlation`; empty if the fit has no result (`message` says why)."""
+    """Correlations of the free parameters: `correlation`; empty if the fit has no result (`message`
+    says why)."""
 
-    parameters: Annotated[list[str], says("Names of the parameters", missing="the fit has no result")] = msgspec.field(
-        default_factory=list
-    )
-    matrix: Annotated[list[list[float]], says("Correlations, a row for each parameter", missing="the fit has no result")] = (
-        msgspec.field(default_factory=list)
-    )
+    parameters: Annotated[
+        list[str], says("Names of the parameters", missing="the fit has no result")
+    ] = msgspec.field(default_factory=list)
+    matrix: Annotated[
+        list[list[float]],
+        says("Correlations, a row for each parameter", missing="the fit has no result"),
+    ] = msgspec.field(default_factory=list)
 
 
 class ProfileTable(Table, kw_only=True):
@@ -91,25 +119,41 @@ class ProfileTable(Table, kw_only=True):
 
 
 class SettingsTable(Table, kw_only=True):
-    """How it was fitted: `settings`. Posterior, profile and bootstrap need it to go on from the fit."""
+    """How it was fitted: `settings`. Posterior, profile and bootstrap need it to go on from the
+    fit."""
 
     free: Annotated[list[str], says("Names of the fitted parameters")]
     residual: Annotated[Literal[RESIDUALS], says("How powers were compared, see docs/fitting.md")]  # pyright: ignore[reportInvalidTypeForm]
-    prior_centre: Annotated[dict[str, float], says("Centre of the prior of every free parameter, in its unit")]
-    prior_sd: Annotated[
-        dict[str, float | None], says("Its standard deviation (of positive ones: of the logarithm), or null: flat")
+    prior_centre: Annotated[
+        dict[str, float], says("Centre of the prior of every free parameter, in its unit")
     ]
-    bounds: Annotated[dict[str, tuple[Number, Number]], says("Bounds that were asked for, null where there is none")]
+    prior_sd: Annotated[
+        dict[str, float | None],
+        says("Its standard deviation (of positive ones: of the logarithm), or null: flat"),
+    ]
+    bounds: Annotated[
+        dict[str, tuple[Number, Number]],
+        says("Bounds that were asked for, null where there is none"),
+    ]
     starts: Annotated[Count, says("Starts of the search")]
-    seeds: Annotated[Count, says("How many seeds correct the formula by simulation; 0: not corrected")]
+    seeds: Annotated[
+        Count, says("How many seeds correct the formula by simulation; 0: not corrected")
+    ]
     check_seeds: Annotated[Count, says("New seeds with which the fit was checked")]
-    max_steps: Annotated[Count, says("Largest number of steps that one search from a starting point may take")]
+    max_steps: Annotated[
+        Count, says("Largest number of steps that one search from a starting point may take")
+    ]
     dt: Annotated[Annotated[float, Meta(gt=0)], says("Step of the noise [s]")]
     increments: Annotated[
         Literal["gaussian", "weak"],
-        says("Random numbers of the simulations: normal ones, or the cheaper ones of docs/engine.md", missing="`gaussian`"),
+        says(
+            "Random numbers of the simulations: normal ones, or the cheaper ones of docs/engine.md",
+            missing="`gaussian`",
+        ),
     ] = "gaussian"
-    coefficient_of_variation: Annotated[bool | dict[str, bool], says("Whether it was data; of several targets by name")]
+    coefficient_of_variation: Annotated[
+        bool | dict[str, bool], says("Whether it was data; of several targets by name")
+    ]
     mean_force: Annotated[
         tuple[float, float] | dict[str, tuple[float, float] | None] | None,
         says("Mean and its error [N] as data, or null; of several targets by name"),
@@ -117,16 +161,25 @@ class SettingsTable(Table, kw_only=True):
     carried: Annotated[
         float | None,
         says(
-            "Number by which forces, stiffness and damping (masses, too, if no target has a `stiffness`) were multiplied "
-            "before the fit, so that the task has the mean force; null if nothing was multiplied"
+            "Number by which forces, stiffness and damping (masses, too, if no target has a"
+            " `stiffness`) were multiplied before the fit, so that the task has the mean force;"
+            " null if nothing was multiplied"
         ),
     ]
     spectrum: Annotated[dict[str, Any], says("Spectrum settings; of several targets by name")]
     steps_per_sample: Annotated[Count, says("Steps of dt between samples")]
-    optimiser: Annotated[str | None, says("Solver; null for Levenberg-Marquardt", missing="Levenberg-Marquardt")] = None
-    separate: Annotated[tuple[str, ...], says("Parameters with a value for each target", missing="fit of one target")] = ()
+    optimiser: Annotated[
+        str | None, says("Solver; null for Levenberg-Marquardt", missing="Levenberg-Marquardt")
+    ] = None
+    separate: Annotated[
+        tuple[str, ...],
+        says("Parameters with a value for each target", missing="fit of one target"),
+    ] = ()
     proportional: Annotated[
-        tuple[str, ...], says("Parameters that differ between targets by a fixed ratio", missing="fit of one target")
+        tuple[str, ...],
+        says(
+            "Parameters that differ between targets by a fixed ratio", missing="fit of one target"
+        ),
     ] = ()
 
 
@@ -136,13 +189,20 @@ class SpectrumTable(Table, kw_only=True):
     frequency_hz: Annotated[list[float], says("Frequencies [Hz]")]
     target: Annotated[list[float], says("Proportional power of the target")]
     fitted: Annotated[
-        Numbers, says("Proportional power of the fit: the mean of new simulations, or from the formula if there are none")
+        Numbers,
+        says(
+            "Proportional power of the fit: the mean of new simulations, or from the formula if"
+            " there are none"
+        ),
     ]
     harmonic_share: Annotated[Numbers, says("Share of the harmonic in each bin")]
     residual: Annotated[Numbers, says("Target against fit, in standard deviations")]
-    deviation: Annotated[Numbers | None, says("Standard deviation of the log power, null where it is unknown")]
+    deviation: Annotated[
+        Numbers | None, says("Standard deviation of the log power, null where it is unknown")
+    ]
     components: Annotated[
-        dict[str, Numbers], says("Share of each bin: relaxation, floor, harmonic, and tremor, resonance_2 if any")
+        dict[str, Numbers],
+        says("Share of each bin: relaxation, floor, harmonic, and tremor, resonance_2 if any"),
     ]
 
 
@@ -154,13 +214,15 @@ class StretchTable(Table, kw_only=True):
 
 
 class PartTable(Table, kw_only=True):
-    """What belongs to one target: beside the keys above, or for several targets under `parts`, by name."""
+    """What belongs to one target: beside the keys above, or for several targets under `parts`, by
+    name."""
 
     target: Annotated[str, says("Name of the target")]
     provenance: Annotated[str, says("Where its numbers are from")]
     task: Annotated[str, says("Name of the task")]
     chi2_per_bin: Annotated[
-        float | None, says("Chi² of spectrum.residual, divided by bins less one; the verdict has adequacy.chi2")
+        float | None,
+        says("Chi² of spectrum.residual, divided by bins less one; the verdict has adequacy.chi2"),
     ]
     rms_log_error: Annotated[float | None, says("Standard deviation of the log of target over fit")]
     spectrum: Annotated[SpectrumTable, says("Spectra")]
@@ -168,27 +230,31 @@ class PartTable(Table, kw_only=True):
     check: Annotated[
         dict[str, float | int],
         says(
-            "How far formula and simulation differ (docs/fitting.md, section How): `seeds`, how many were simulated; the "
-            "largest difference among the bins, each of the three for itself: relative to the formula "
-            "(`largest_deviation`), in standard errors of the simulated mean (`largest_deviation_se`), in standard "
-            "deviations of the measured bin (`largest_deviation_sd`); by how many of its errors the polish moved a "
-            "quantity at most (`polish_moved_se`), and its rounds (`polish_turns`)"
+            "How far formula and simulation differ (docs/fitting.md, section How): `seeds`, how"
+            " many were simulated; the largest difference among the bins, each of the three for"
+            " itself: relative to the formula (`largest_deviation`), in standard errors of the"
+            " simulated mean (`largest_deviation_se`), in standard deviations of the measured bin"
+            " (`largest_deviation_sd`); by how many of its errors the polish moved a quantity at"
+            " most (`polish_moved_se`), and its rounds (`polish_turns`)"
         ),
     ]
     further: Annotated[
         dict[str, float],
         says(
-            "Residuals [standard deviations] of `coefficient_of_variation` and `mean`, each only if the fit had it as data"
+            "Residuals [standard deviations] of `coefficient_of_variation` and `mean`, each only if"
+            " the fit had it as data"
         ),
     ]
     stiffness: Annotated[
         tuple[list[float], list[float]] | None,
         says(
-            "Fitted dynamic stiffness, real and imaginary part [N/m], at the frequencies of `target_table.stiffness` whose "
-            "`stderr` is finite; null without one"
+            "Fitted dynamic stiffness, real and imaginary part [N/m], at the frequencies of"
+            " `target_table.stiffness` whose `stderr` is finite; null without one"
         ),
     ]
-    target_table: Annotated[dict[str, Any], says("The target, as in a target file; null for what it does not state")]
+    target_table: Annotated[
+        dict[str, Any], says("The target, as in a target file; null for what it does not state")
+    ]
     task_table: Annotated[dict[str, Any], says("The fitted task, as in a preset")]
 
 
@@ -198,25 +264,40 @@ class FitTable(Table, kw_only=True):
     format: Annotated[Literal[FORMATS], says("Version of the format")]  # pyright: ignore[reportInvalidTypeForm]
     success: Annotated[bool, says("Whether the search converged")]
     message: Annotated[str, says("How the search ended")]
-    adequate: Annotated[bool | None, says("Whether the model describes the data, null where that is unknown")]
+    adequate: Annotated[
+        bool | None, says("Whether the model describes the data, null where that is unknown")
+    ]
     adequacy_p: Annotated[Share | None, says("p-value of that verdict")]
     adequacy: Annotated[AdequacyTable | None, says("Numbers behind that verdict")]
     verdict: Annotated[str, says("Verdict in words")]
     method: Annotated[Literal[METHODS], says("How it was fitted")]  # pyright: ignore[reportInvalidTypeForm]
-    parameters: Annotated[dict[str, EstimateTable], says("Every parameter; of several targets also name@target")]
+    parameters: Annotated[
+        dict[str, EstimateTable], says("Every parameter; of several targets also name@target")
+    ]
     derived: Annotated[dict[str, EstimateTable], says("Quantities that follow from the parameters")]
     products: Annotated[
         list[str],
-        says("What of the parameters the data determine: single ones, products (`k_w noise_K_w`), ratios (`k_w / c_w`)"),
+        says(
+            "What of the parameters the data determine: single ones, products (`k_w noise_K_w`),"
+            " ratios (`k_w / c_w`)"
+        ),
     ]
-    per_newton: Annotated[dict[str, Number], says("Stiffness [1/m] and damping [s/m] over the mean force")]
+    per_newton: Annotated[
+        dict[str, Number], says("Stiffness [1/m] and damping [s/m] over the mean force")
+    ]
     correlation: Annotated[CorrelationTable, says("Correlations of the free parameters")]
-    undetermined: Annotated[list[str], says("Sentences: which parameters can change together while the spectrum stays")]
+    undetermined: Annotated[
+        list[str], says("Sentences: which parameters can change together while the spectrum stays")
+    ]
     ladder: Annotated[list[RungTable], says("Models that were tried")]
-    singular_values: Annotated[Numbers, says("Singular values of the Jacobian, a number for each direction")]
+    singular_values: Annotated[
+        Numbers, says("Singular values of the Jacobian, a number for each direction")
+    ]
     starts: Annotated[list[StartTable], says("Where each start of the search ended")]
     profile: Annotated[ProfileTable | None, says("Profile of the frequency of the harmonic")]
-    harmonic_p_value: Annotated[Share | None, says("p-value of the harmonic: how often chance makes one as strong")]
+    harmonic_p_value: Annotated[
+        Share | None, says("p-value of the harmonic: how often chance makes one as strong")
+    ]
     notices: Annotated[list[str], says("Notes on the fit")]
     seed: Annotated[
         Annotated[int, Meta(ge=0, lt=SEEDS)] | None,
@@ -227,24 +308,36 @@ class FitTable(Table, kw_only=True):
 
 
 def disagreement(result: "FitResult") -> str | None:
-    """In words, where parts of a result contradict each other that are not made from each other; None if nowhere."""
+    """In words, where parts of a result contradict each other that are not made from each other;
+    None if nowhere."""
     settings, free = result.settings, set(result.free)
     for key in ("free", "prior_centre", "prior_sd"):
         if set(settings[key]) != free:
-            return f"settings.{key} names {_names(settings[key])}, but free among the parameters are {_names(free)}"
+            return (
+                f"settings.{key} names {_names(settings[key])}, but free among the parameters are"
+                f" {_names(free)}"
+            )
     if any(len(start.values) not in (0, len(free)) for start in result.starts):
         return f"starts: values needs a number for each of {_names(free)}"
     if not set(settings["bounds"]) <= free:
         return f"settings.bounds names {_names(settings['bounds'])}, but free are {_names(free)}"
     if len(result.parts) > 1 and not {"separate", "proportional"} <= set(settings):
-        return "settings has no key 'separate' or 'proportional', which the fit of several targets has"
+        return (
+            "settings has no key 'separate' or 'proportional', which the fit of several targets has"
+        )
     spectra = {name: part.target.settings.to_dict() for name, part in result.parts.items()}
-    used = settings["spectrum"] if len(spectra) > 1 else {name: settings["spectrum"] for name in spectra}
+    used = (
+        settings["spectrum"]
+        if len(spectra) > 1
+        else {name: settings["spectrum"] for name in spectra}
+    )
     if differs := contradiction(used, spectra, "settings.spectrum"):
         return differs
     of = result.correlation
     if len(of) == 1 or (
-        of and (len(of["matrix"]), *map(len, of["matrix"])) != (len(of["parameters"]),) * (1 + len(of["parameters"]))
+        of
+        and (len(of["matrix"]), *map(len, of["matrix"]))
+        != (len(of["parameters"]),) * (1 + len(of["parameters"]))
     ):
         return "correlation.matrix needs a row and a column for each of correlation.parameters"
     if result.profile is not None and len(result.profile[0]) != len(result.profile[1]):
@@ -258,7 +351,11 @@ def _values(result: "FitResult") -> str | None:
         base, own = base_of(name), target_of(name)
         if own and own not in result.tasks:
             return f"parameters.{name}: there is no target {own!r}"
-        tasks = [result.tasks[own]] if own else [task for task in result.tasks.values() if base in task.parameter_names]
+        tasks = (
+            [result.tasks[own]]
+            if own
+            else [task for task in result.tasks.values() if base in task.parameter_names]
+        )
         if not tasks or base not in tasks[0].parameter_names:
             return f"parameters.{name}: no task has this parameter"
         value = float(tasks[0][base])
@@ -273,7 +370,10 @@ def _values(result: "FitResult") -> str | None:
 def check_lengths(table: PartTable, target: Target) -> None:
     """Raise a `ValueError` for columns that have not a number for each bin, or for each time."""
     spectrum, bins = table.spectrum, len(target.bins)
-    columns = {name: getattr(spectrum, name) for name in ("fitted", "harmonic_share", "residual", "deviation")}
+    columns = {
+        name: getattr(spectrum, name)
+        for name in ("fitted", "harmonic_share", "residual", "deviation")
+    }
     for name, column in (columns | spectrum.components).items():
         if column is not None and len(column) != bins:
             raise ValueError(f"spectrum.{name} has {len(column)} numbers, the target {bins} bins")
@@ -282,7 +382,10 @@ def check_lengths(table: PartTable, target: Target) -> None:
     known = 0 if target.stiffness is None else len(target.stiffness.known.frequency)
     real, imaginary = table.stiffness or ([], [])
     if not len(real) == len(imaginary) == known:
-        raise ValueError(f"stiffness has {len(real)} real and {len(imaginary)} imaginary parts, the target {known}")
+        raise ValueError(
+            f"stiffness has {len(real)} real and {len(imaginary)} imaginary parts, the target"
+            f" {known}"
+        )
 
 
 def _names(names: Iterable[str]) -> str:

@@ -1,4 +1,5 @@
-"""95 % interval of a half-power frequency: the frequencies at which the response may have half its power."""
+"""95 % interval of a half-power frequency: the frequencies at which the response may have half its
+power."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -32,15 +33,21 @@ OPEN = Interval(None, None, log=True)
 
 
 def half_power_intervals(
-    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, widening: Mapping[str, float]
+    problem: FitProblem,
+    objective: Residuals,
+    seen: Expansion,
+    covariance: np.ndarray,
+    widening: Mapping[str, float],
 ) -> dict[str, Interval]:
-    """The frequencies at which the response may have half its power, from the lowest to the highest; of each of the names.
+    """The frequencies at which the response may have half its power, from the lowest to the
+    highest; of each of the names.
 
-    `L(f) = ln(2 |H(f)|² / |H(0)|²)` is zero at the true one, whatever the shape of the response. So f belongs to the
-    interval if L(f) can be held at zero, all else fitted anew, and twice the cost rises by at most
-    `3.84 w² gᵀ C g / gᵀ G g`: g is the slope of L(f) with respect to θ, C the covariance of the estimates, G the inverse
-    curvature of the cost, w by how much the errors of this quantity are widened (`widening`, of every name). Open at both
-    ends, which means not determined, if it leaves the compared bins and points: no data are there.
+    `L(f) = ln(2 |H(f)|² / |H(0)|²)` is zero at the true one, whatever the shape of the response. So
+    f belongs to the interval if L(f) can be held at zero, all else fitted anew, and twice the cost
+    rises by at most `3.84 w² gᵀ C g / gᵀ G g`: g is the slope of L(f) with respect to θ, C the
+    covariance of the estimates, G the inverse curvature of the cost, w by how much the errors of
+    this quantity are widened (`widening`, of every name). Open at both ends, which means not
+    determined, if it leaves the compared bins and points: no data are there.
 
     Of fits in linear response with log residuals only (empty otherwise).
 
@@ -48,22 +55,32 @@ def half_power_intervals(
     """
     if not objective.linear or problem.residual != "log":
         return {}
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a row that runs away belongs to no interval
-        return {name: _interval(problem, objective, seen, factor**2 * covariance, name) for name, factor in widening.items()}
+    # a row that runs away belongs to no interval
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        return {
+            name: _interval(problem, objective, seen, factor**2 * covariance, name)
+            for name, factor in widening.items()
+        }
 
 
-def _interval(problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, name: str) -> Interval:
+def _interval(
+    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, name: str
+) -> Interval:
     """Damped Gauss-Newton steps from the ridge `θ - G g L / (gᵀ G g)`, all frequencies at once.
 
-    After each step a frequency goes on from where it stands best, be it another's place. One that rests is left out until
-    another's place suits it better.
+    After each step a frequency goes on from where it stands best, be it another's place. One that
+    rests is left out until another's place suits it better.
     """
     found = _Search.of(problem, objective, seen, covariance, name)
     if found is None:
         return OPEN
     search, theta = found
     here = search.look(theta).shared(search)
-    damping, merit, quiet = np.full(len(theta), 1e-2), here.merit(search), np.zeros(len(theta), dtype=int)
+    damping, merit, quiet = (
+        np.full(len(theta), 1e-2),
+        here.merit(search),
+        np.zeros(len(theta), dtype=int),
+    )
     for _ in range(TURNS):
         moving = quiet < QUIET
         tried = here.moved(moving, search.look((here.theta + here.step(search, damping))[moving]))
@@ -72,16 +89,19 @@ def _interval(problem: FitProblem, objective: Residuals, seen: Expansion, covari
         here, before = here.where(better, tried).shared(search), merit
         merit = here.merit(search)
         gain = before - merit
-        quiet = np.where(gain >= GAIN, 0, quiet + (better | (damping > STIFF)))  # a shorter step may do better
+        # a shorter step may do better
+        quiet = np.where(gain >= GAIN, 0, quiet + (better | (damping > STIFF)))
         if np.all(quiet[search.rise(merit) < NEAR] >= QUIET) or search.reaches_an_edge(merit):
             break
     return search.ends(merit)
 
 
 class _Search(NamedTuple):
-    """One row for each frequency [ln Hz] that is tried: below the value `top` and then above it, outward.
+    """One row for each frequency [ln Hz] that is tried: below the value `top` and then above it,
+    outward.
 
-    `tight`, how closely its level is held; `wanted`, root of the rise of twice the `cost` that ends the interval.
+    `tight`, how closely its level is held; `wanted`, root of the rise of twice the `cost` that ends
+    the interval.
     """
 
     problem: FitProblem
@@ -95,9 +115,15 @@ class _Search(NamedTuple):
 
     @classmethod
     def of(
-        cls, problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, name: str
+        cls,
+        problem: FitProblem,
+        objective: Residuals,
+        seen: Expansion,
+        covariance: np.ndarray,
+        name: str,
     ) -> "tuple[_Search, Float[np.ndarray, 'rows free']] | None":
-        """With the point of the ridge of each frequency; nothing where the value is outside the compared bins."""
+        """With the point of the ridge of each frequency; nothing where the value is outside the
+        compared bins."""
         part, _ = problem.where(name)
         here = Point.of(problem, objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
         value, slope = (pair[0] for pair in here.quantity(name))
@@ -107,12 +133,24 @@ class _Search(NamedTuple):
             return None
         sd = float(np.sqrt(slope @ covariance @ slope) / value)
         log_f = np.concatenate([_aims(top, sd, edge) for edge in (low, high)])
-        everywhere = np.tile(here.theta, (len(log_f), 1)), np.tile(log_f, (len(log_f), 1))  # one size, one program
+        # one size, one program
+        everywhere = np.tile(here.theta, (len(log_f), 1)), np.tile(log_f, (len(log_f), 1))
         level, g = (x[0] for x in _levels_of(objective, part, *everywhere))
-        gain = np.linalg.pinv(here.jacobian[0].T @ here.jacobian[0] + np.diag(problem.prior), hermitian=True)
+        gain = np.linalg.pinv(
+            here.jacobian[0].T @ here.jacobian[0] + np.diag(problem.prior), hermitian=True
+        )
         ours, stated = (np.einsum("fi,ij,fj->f", g, matrix, g) for matrix in (gain, covariance))
         tight = np.minimum(HELD * np.sqrt(ours), LOOSE)
-        search = cls(problem, objective, part, top, log_f, tight, REACH * np.sqrt(stated / ours), float(here.cost[0]))
+        search = cls(
+            problem,
+            objective,
+            part,
+            top,
+            log_f,
+            tight,
+            REACH * np.sqrt(stated / ours),
+            float(here.cost[0]),
+        )
         return search, here.theta[0] - (g @ gain) * (level / ours)[:, None]
 
     def look(self, theta: Float[np.ndarray, "rows free"]) -> "_Rows":
@@ -121,9 +159,13 @@ class _Search(NamedTuple):
         point = Point.of(self.problem, self.objective, expand(self.objective, theta))
         # One size, so that one program serves all.
         every = np.minimum(np.arange(len(self.log_f)), len(theta) - 1)
-        levels, slopes = _levels_of(self.objective, self.part, theta[every], np.tile(self.log_f, (len(every), 1)))
+        levels, slopes = _levels_of(
+            self.objective, self.part, theta[every], np.tile(self.log_f, (len(every), 1))
+        )
         count = len(theta)
-        return _Rows(theta, levels[:count], slopes[:count], point.residual, point.jacobian, point.cost)
+        return _Rows(
+            theta, levels[:count], slopes[:count], point.residual, point.jacobian, point.cost
+        )
 
     def rise(self, merit: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
         """Root of twice the rise of the cost, over that at the end of the interval."""
@@ -148,7 +190,8 @@ class _Search(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Of each row θ, the level at every frequency with its slopes, data residuals with slopes, and cost."""
+    """Of each row θ, the level at every frequency with its slopes, data residuals with slopes, and
+    cost."""
 
     theta: Float[np.ndarray, "rows free"]
     level: Float[np.ndarray, "rows rows"]
@@ -182,15 +225,25 @@ class _Rows(NamedTuple):
     def step(self, search: _Search, damping: np.ndarray) -> Float[np.ndarray, "rows free"]:
         """A damped Gauss-Newton step of the merit, at most one prior standard deviation."""
         rows = np.arange(len(self.theta))
-        pull, rise = self.level[rows, rows] / search.tight, self.slope[rows, rows] / search.tight[:, None]
+        pull, rise = (
+            self.level[rows, rows] / search.tight,
+            self.slope[rows, rows] / search.tight[:, None],
+        )
         return held_step(search.problem, self, pull, rise, damping)
 
 
 def _compared(target: Target, model: Any) -> tuple[float, float]:
-    """From where to where [Hz] there are data: edges of the outer bins, or points of a measured dynamic stiffness beyond."""
+    """From where to where [Hz] there are data: edges of the outer bins, or points of a measured
+    dynamic stiffness beyond."""
     half = target.settings.resolution / 2
     points = getattr(model, "points", None)
-    found = np.concatenate([target.frequency - half, target.frequency + half, [] if points is None else np.asarray(points)])
+    found = np.concatenate(
+        [
+            target.frequency - half,
+            target.frequency + half,
+            [] if points is None else np.asarray(points),
+        ]
+    )
     return float(found.min()), float(found.max())
 
 
@@ -201,16 +254,23 @@ def _aims(top: float, sd: float, edge: float) -> Float[np.ndarray, " each"]:
 
 
 def _levels_of(
-    objective: Residuals, part: int, theta: Float[np.ndarray, "rows free"], log_f: Float[np.ndarray, "rows points"]
+    objective: Residuals,
+    part: int,
+    theta: Float[np.ndarray, "rows free"],
+    log_f: Float[np.ndarray, "rows points"],
 ) -> tuple[Float[np.ndarray, "rows points"], Float[np.ndarray, "rows points free"]]:
-    """`ln(2 |H(f)|² / |H(0)|²)` of one part at every row's frequencies [ln Hz], and its slopes with respect to θ.
+    """`ln(2 |H(f)|² / |H(0)|²)` of one part at every row's frequencies [ln Hz], and its slopes with
+    respect to θ.
 
-    It is zero where f is the half-power frequency, in a fit that was corrected by simulation the corrected one.
+    It is zero where f is the half-power frequency, in a fit that was corrected by simulation the
+    corrected one.
     """
     model = objective.parts[part].model
     shift = float(np.log(model.correction.half)) if isinstance(model, Linear) else 0.0
     own = objective.parts[part]
-    levels, slopes = _levels(mechanics(own.task), own.coordinates, np.asarray(objective.own(theta, part)), log_f - shift)
+    levels, slopes = _levels(
+        mechanics(own.task), own.coordinates, np.asarray(objective.own(theta, part)), log_f - shift
+    )
     return np.asarray(levels), objective.spread(np.asarray(slopes), part)
 
 

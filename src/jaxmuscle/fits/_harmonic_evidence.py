@@ -1,4 +1,5 @@
-"""Is the harmonic there, and at which frequency? Profile of chi² over it, and a parametric bootstrap without it."""
+"""Is the harmonic there, and at which frequency? Profile of chi² over it, and a parametric
+bootstrap without it."""
 
 from typing import NamedTuple
 
@@ -23,18 +24,23 @@ REPLICATES = 999
 
 
 class HarmonicTest(NamedTuple):
-    """`rise` of chi² above its minimum over `frequency` [Hz], all else fitted anew; p-value of the harmonic or None."""
+    """`rise` of chi² above its minimum over `frequency` [Hz], all else fitted anew; p-value of the
+    harmonic or None."""
 
     frequency: Float[np.ndarray, " frequencies"]
     rise: Float[np.ndarray, " frequencies"]
     p_value: float | None
 
 
-def harmonic_test(problem: FitProblem, final: Minima, *, judged: bool = True) -> HarmonicTest | None:
-    """Profile and p-value in linear response; None for several targets, without one, or if the harmonic is not fitted.
+def harmonic_test(
+    problem: FitProblem, final: Minima, *, judged: bool = True
+) -> HarmonicTest | None:
+    """Profile and p-value in linear response; None for several targets, without one, or if the
+    harmonic is not fitted.
 
-    No p-value unless `judged`: about a model that does not describe the data anything improves the fit.
-    All bins scatter here as if none held a line (see `bin_statistics`): else the best frequency would count for more.
+    No p-value unless `judged`: about a model that does not describe the data anything improves the
+    fit. All bins scatter here as if none held a line (see `bin_statistics`): else the best
+    frequency would count for more.
     """
     names = problem.coordinates.names
     if len(problem.parts) > 1 or not problem.control or "harmonic_frequency" not in names:
@@ -59,7 +65,9 @@ def _pinned(objective: Residuals, columns: list[int]) -> Residuals:
     return eqx.tree_at(lambda p: p.moving, objective, moving)
 
 
-def _profile(problem: FitProblem, objective: Residuals, final: Minima) -> tuple[np.ndarray, np.ndarray]:
+def _profile(
+    problem: FitProblem, objective: Residuals, final: Minima
+) -> tuple[np.ndarray, np.ndarray]:
     coordinates, column = problem.coordinates, problem.coordinates.names.index("harmonic_frequency")
     frequency = over_band(problem.parts[0].target, PROFILE)
     theta = np.tile(np.asarray(coordinates.theta(final.s[final.best])), (len(frequency), 1))
@@ -70,11 +78,13 @@ def _profile(problem: FitProblem, objective: Residuals, final: Minima) -> tuple[
 
 
 def p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
-    """Improvement of chi² by a harmonic of any frequency and strength, against that in spectra that have none.
+    """Improvement of chi² by a harmonic of any frequency and strength, against that in spectra that
+    have none.
 
-    The model without harmonic is fitted; about it the other parameters are linear (`M` removes what they take up), a
-    harmonic adds `ln(1 + g line_k(f) / power_k)` to the log powers, and the improvement is the largest over a grid of f
-    and g. The same is done with spectra drawn from that model: scaled chi² bins, correlated as Welch's are.
+    The model without harmonic is fitted; about it the other parameters are linear (`M` removes what
+    they take up), a harmonic adds `ln(1 + g line_k(f) / power_k)` to the log powers, and the
+    improvement is the largest over a grid of f and g. The same is done with spectra drawn from that
+    model: scaled chi² bins, correlated as Welch's are.
     """
     names = problem.coordinates.names
     columns = [names.index(name) for name in HARMONIC]
@@ -87,9 +97,14 @@ def p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
 
 
 def p_of_line_left_out(ended: Endpoint) -> float:
-    """The same for a fit of a model without harmonic, of one target; 1 where that has no spectrum in logarithms."""
+    """The same for a fit of a model without harmonic, of one target; 1 where that has no spectrum
+    in logarithms."""
     (part,) = ended.problem.parts
-    if ended.problem.residual != "log" or not len(part.target.bins) or not ended.objective.parts[0].statistics.known:
+    if (
+        ended.problem.residual != "log"
+        or not len(part.target.bins)
+        or not ended.objective.parts[0].statistics.known
+    ):
         return 1.0
     return _p_of_line(ended, np.arange(len(ended.problem.coordinates.names)))
 
@@ -108,7 +123,9 @@ def _p_of_line(ended: Endpoint, kept: Int[np.ndarray, " kept"]) -> float:
     logs = np.log1p(tried.square[:, None] * tried.each / null.power)
     added[:, :n] = -(logs - logs.mean(axis=1, keepdims=True)) / sd
     if own.data.variation is not None:
-        added[:, n] = 0.5 * np.log1p(tried.square / float(null.variance)) / float(own.data.variation[1])
+        added[:, n] = (
+            0.5 * np.log1p(tried.square / float(null.variance)) / float(own.data.variation[1])
+        )
     left = added @ without_fitted(jacobian)
     size = np.sum(left**2, axis=1)
 

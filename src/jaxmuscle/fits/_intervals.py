@@ -14,7 +14,8 @@ from jaxmuscle.objective._residuals import Residuals
 
 REACH = 1.96
 TURNS = 50  # at most, of steps and of moves to the next stage
-FIRST, FASTER, SLOWER = 0.4, 2.5, 0.4  # of the way that the curvature says; how much further or nearer a row aims next
+# of the way that the curvature says; how much further or nearer a row aims next
+FIRST, FASTER, SLOWER = 0.4, 2.5, 0.4
 GAIN = 0.01  # of the rise: what a turn gains less, it need not go on for
 NEAR = 0.05  # of the rise at the end
 HELD = 0.1  # of the standard deviation
@@ -24,7 +25,8 @@ MOST_ROWS = 32  # of one batch
 
 
 class Interval(NamedTuple):
-    """Ends of an interval, relative to the value (`log`) or as differences from it; None where it is open."""
+    """Ends of an interval, relative to the value (`log`) or as differences from it; None where it
+    is open."""
 
     low: float | None
     high: float | None
@@ -32,28 +34,39 @@ class Interval(NamedTuple):
 
     def about(self, value: float) -> tuple[float | None, float | None]:
         """The ends in the unit of the value."""
-        low, high = (None if d is None else float(value * np.exp(d) if self.log else value + d) for d in self[:2])
+        low, high = (
+            None if d is None else float(value * np.exp(d) if self.log else value + d)
+            for d in self[:2]
+        )
         return low, high
 
 
 def intervals(
-    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, widening: Mapping[str, float]
+    problem: FitProblem,
+    objective: Residuals,
+    seen: Expansion,
+    covariance: np.ndarray,
+    widening: Mapping[str, float],
 ) -> dict[str, Interval]:
-    """Where twice the cost, all else fitted anew, has risen by 3.84 times the factor that correlated bins ask for.
+    """Where twice the cost, all else fitted anew, has risen by 3.84 times the factor that
+    correlated bins ask for.
 
-    A quantity q is moved along the ridge `θ + G g (q* - q) / (gᵀ G g)`, G the inverse curvature of the cost and g the slope
-    of q. It moves in stages, two fifths of the way at first: where the ridge bends, the far end of the straight line costs a
-    hundred times too much. In each stage it is held while damped Gauss-Newton steps lower the cost, until they gain little.
-    The next stage begins on the line from the fit through where it stands, further out or in. The last is where the rise is
-    `3.84 w² gᵀ C g / gᵀ G g`, C the covariance of the estimates, w by how much the errors of this quantity are widened
-    (`widening`, of every name). Positive quantities move in their logarithm. All at once.
+    A quantity q is moved along the ridge `θ + G g (q* - q) / (gᵀ G g)`, G the inverse curvature of
+    the cost and g the slope of q. It moves in stages, two fifths of the way at first: where the
+    ridge bends, the far end of the straight line costs a hundred times too much. In each stage it
+    is held while damped Gauss-Newton steps lower the cost, until they gain little. The next stage
+    begins on the line from the fit through where it stands, further out or in. The last is where
+    the rise is `3.84 w² gᵀ C g / gᵀ G g`, C the covariance of the estimates, w by how much the
+    errors of this quantity are widened (`widening`, of every name). Positive quantities move in
+    their logarithm. All at once.
 
     Of fits in linear response with log residuals only (empty otherwise).
     """
     if not objective.linear or problem.residual != "log":
         return {}
     found: dict[str, Interval] = {}
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a row that runs away is an open end
+    # a row that runs away is an open end
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for start in range(0, len(widening), MOST_ROWS // 2):
             some = dict(itertools.islice(widening.items(), start, start + MOST_ROWS // 2))
             found |= _some(problem, objective, seen, covariance, some)
@@ -61,7 +74,11 @@ def intervals(
 
 
 def _some(
-    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, widening: Mapping[str, float]
+    problem: FitProblem,
+    objective: Residuals,
+    seen: Expansion,
+    covariance: np.ndarray,
+    widening: Mapping[str, float],
 ) -> dict[str, Interval]:
     names = list(widening)
     here = Point.of(problem, objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
@@ -73,7 +90,9 @@ def _some(
     slope = np.where(log[:, None], slope / np.where(log, value, 1.0)[:, None], slope)
     start = np.where(log, np.log(np.where(log, value, 1.0)), value)
     ours = np.einsum("ri,ij,rj->r", slope, gain, slope)
-    stated = np.repeat(list(widening.values()), 2) * np.sqrt(np.einsum("ri,ij,rj->r", slope, covariance, slope))
+    stated = np.repeat(list(widening.values()), 2) * np.sqrt(
+        np.einsum("ri,ij,rj->r", slope, covariance, slope)
+    )
     wanted = REACH * stated / np.sqrt(ours)  # root of the rise that is sought
     side = np.tile([-1.0, 1.0], len(names))
     way = np.full(len(start), FIRST)  # that each row is to go, of what the curvature says
@@ -82,7 +101,11 @@ def _some(
     theta = here.theta[0] + (slope @ gain) * ((aim - start) / ours)[:, None]
     best = _look(problem, objective, theta, np.arange(len(theta)), names, log)
     damping = np.full(len(aim), 1e-2)
-    done, moving, further = np.zeros(len(aim), dtype=bool), np.zeros(len(aim), dtype=bool), best.theta
+    done, moving, further = (
+        np.zeros(len(aim), dtype=bool),
+        np.zeros(len(aim), dtype=bool),
+        best.theta,
+    )
     for _ in range(TURNS):
         trial = np.where(moving[:, None], further, best.theta + best.step(aim, tight, damping))
         tried = best.moved(objective, trial, ~done, names, log)
@@ -92,7 +115,9 @@ def _some(
         damping = np.where(moving, 1e-2, np.where(better, 0.2 * damping, 10 * damping))
         rise = best.rise(here)
         settled = ~moving & (np.abs(gain_of_all) < GAIN * np.maximum(rise, NEAR * wanted) ** 2)
-        done |= settled & ((np.abs(rise - wanted) < NEAR * wanted) | ((way == FURTHEST) & (rise < wanted)))
+        done |= settled & (
+            (np.abs(rise - wanted) < NEAR * wanted) | ((way == FURTHEST) & (rise < wanted))
+        )
         if np.all(done):
             break
         moving = settled & ~done  # to the next stage
@@ -105,11 +130,14 @@ def _some(
     end = moved * wanted / rise
     good = np.isfinite(end) & (moved > 0) & (rise > 0.5 * wanted)
     ends = [float(s * e) if fine else None for s, e, fine in zip(side, end, good, strict=True)]
-    return {n: Interval(ends[2 * i], ends[2 * i + 1], bool(log[2 * i])) for i, n in enumerate(names)}
+    return {
+        n: Interval(ends[2 * i], ends[2 * i + 1], bool(log[2 * i])) for i, n in enumerate(names)
+    }
 
 
 class _Look(NamedTuple):
-    """Rows of θ, of each its own quantity `at` (or its logarithm) with slopes, data residuals with slopes, and cost."""
+    """Rows of θ, of each its own quantity `at` (or its logarithm) with slopes, data residuals with
+    slopes, and cost."""
 
     problem: FitProblem
     theta: np.ndarray
@@ -120,12 +148,20 @@ class _Look(NamedTuple):
     cost: np.ndarray
 
     def moved(
-        self, objective: Residuals, theta: np.ndarray, which: np.ndarray, names: list[str], log: np.ndarray
+        self,
+        objective: Residuals,
+        theta: np.ndarray,
+        which: np.ndarray,
+        names: list[str],
+        log: np.ndarray,
     ) -> "_Look":
         """Some rows at another θ, the others as they are."""
         rows = np.flatnonzero(which)
         return _Look(
-            self.problem, *renewed(rows, _look(self.problem, objective, theta[rows], rows, names, log)[1:], self[1:])
+            self.problem,
+            *renewed(
+                rows, _look(self.problem, objective, theta[rows], rows, names, log)[1:], self[1:]
+            ),
         )
 
     def where(self, chosen: np.ndarray, other: "_Look") -> "_Look":
@@ -163,37 +199,61 @@ class Seen(Protocol):
 def held_step(
     problem: FitProblem, seen: Seen, pull: np.ndarray, rise: np.ndarray, damping: np.ndarray
 ) -> Float[np.ndarray, "rows free"]:
-    """A damped Gauss-Newton step of `cost + ½ pull²` in every row, at most one prior standard deviation.
+    """A damped Gauss-Newton step of `cost + ½ pull²` in every row, at most one prior standard
+    deviation.
 
-    `pull`, how far what is held is from where it is held, in units of how tightly; `rise`, its slope.
+    `pull`, how far what is held is from where it is held, in units of how tightly; `rise`, its
+    slope.
     """
     prior = np.diag(problem.prior)
-    curvature = np.einsum("rki,rkj->rij", seen.jacobian, seen.jacobian) + prior + rise[:, :, None] * rise[:, None]
-    gradient = np.einsum("rki,rk->ri", seen.jacobian, seen.residual) + seen.theta @ prior + pull[:, None] * rise
+    curvature = (
+        np.einsum("rki,rkj->rij", seen.jacobian, seen.jacobian)
+        + prior
+        + rise[:, :, None] * rise[:, None]
+    )
+    gradient = (
+        np.einsum("rki,rk->ri", seen.jacobian, seen.residual)
+        + seen.theta @ prior
+        + pull[:, None] * rise
+    )
     size = np.maximum(np.diagonal(curvature, axis1=1, axis2=2), 1e-8)
     curvature = curvature + (damping[:, None] * size)[:, None] * np.eye(len(prior))
     fine = np.isfinite(seen.cost) & np.all(np.isfinite(gradient), axis=1)
     step = np.zeros_like(seen.theta)
     step[fine] = -np.linalg.solve(curvature[fine], gradient[fine][..., None])[..., 0]
-    return step * np.minimum(1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300))
+    return step * np.minimum(
+        1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300)
+    )
 
 
-def renewed(which: np.ndarray, new: Sequence[np.ndarray], old: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Arrays with a leading axis of rows, in some of which the new ones stand: these have no others."""
+def renewed(
+    which: np.ndarray, new: Sequence[np.ndarray], old: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Arrays with a leading axis of rows, in some of which the new ones stand: these have no
+    others."""
     found = [own.copy() for own in old]
     for own, other in zip(found, new, strict=True):
         own[which] = other
     return found
 
 
-def chosen_rows(chosen: np.ndarray, new: Sequence[np.ndarray], old: Sequence[np.ndarray]) -> list[np.ndarray]:
+def chosen_rows(
+    chosen: np.ndarray, new: Sequence[np.ndarray], old: Sequence[np.ndarray]
+) -> list[np.ndarray]:
     """Arrays with a leading axis of rows: the new ones where they are chosen."""
-    return [np.where(chosen.reshape(-1, *[1] * (np.ndim(own) - 1)), other, own)
-            for other, own in zip(new, old, strict=True)]  # fmt: skip
+    return [
+        np.where(chosen.reshape(-1, *[1] * (np.ndim(own) - 1)), other, own)
+        for other, own in zip(new, old, strict=True)
+    ]
 
 
 def _look(
-    problem: FitProblem, objective: Residuals, theta: np.ndarray, rows: np.ndarray, names: list[str], log: np.ndarray
+    problem: FitProblem,
+    objective: Residuals,
+    theta: np.ndarray,
+    rows: np.ndarray,
+    names: list[str],
+    log: np.ndarray,
 ) -> _Look:
     """Each of these rows with its own quantity: of every name there are two."""
     theta, log = np.clip(theta, -MOST, MOST), log[rows]
@@ -204,12 +264,16 @@ def _look(
         own = rows // 2 == i
         value[own], slope[own] = values[own], slopes[own]
     positive = np.maximum(value, 1e-300)
-    at, slope = np.where(log, np.log(positive), value), np.where(log[:, None], slope / positive[:, None], slope)
+    at, slope = (
+        np.where(log, np.log(positive), value),
+        np.where(log[:, None], slope / positive[:, None], slope),
+    )
     return _Look(problem, theta, at, slope, point.residual, point.jacobian, point.cost)
 
 
 class Point(NamedTuple):
-    """What a fit sees at rows of θ: data residuals, their slopes, cost `½ Σ r² + ½ Σ θ²`, tables of quantities."""
+    """What a fit sees at rows of θ: data residuals, their slopes, cost `½ Σ r² + ½ Σ θ²`, tables of
+    quantities."""
 
     problem: FitProblem
     theta: np.ndarray
@@ -221,14 +285,26 @@ class Point(NamedTuple):
     @classmethod
     def of(cls, problem: FitProblem, objective: Residuals, seen: Expansion) -> "Point":
         count = len(seen.theta)
-        rows = np.minimum(np.arange(MOST_ROWS), count - 1)  # one size, so that one program serves all
+        # one size, so that one program serves all
+        rows = np.minimum(np.arange(MOST_ROWS), count - 1)
         found = consequences_of_rows(objective, jax.tree.map(lambda x: np.asarray(x)[rows], seen))
         found = jax.tree.map(lambda x: x[:count], found)
-        cost = 0.5 * np.sum(found.residuals**2, axis=1) + 0.5 * np.sum(problem.prior * seen.theta**2, axis=1)
+        cost = 0.5 * np.sum(found.residuals**2, axis=1) + 0.5 * np.sum(
+            problem.prior * seen.theta**2, axis=1
+        )
         tables = problem.by_name(found.values), problem.by_name(found.slopes)
-        return cls(problem, seen.theta, found.residuals, found.jacobian, np.where(np.isfinite(cost), cost, np.inf), tables)
+        return cls(
+            problem,
+            seen.theta,
+            found.residuals,
+            found.jacobian,
+            np.where(np.isfinite(cost), cost, np.inf),
+            tables,
+        )
 
-    def quantity(self, name: str) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows free"]]:
+    def quantity(
+        self, name: str
+    ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows free"]]:
         """A free parameter or derived quantity and its slopes with respect to θ."""
         c = self.problem.coordinates
         if name not in c.names:

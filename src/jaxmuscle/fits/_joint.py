@@ -64,58 +64,89 @@ def fit_joint(
     rungs: int = 0,
     answer: Callable[[FitResult], None] | None = None,
 ) -> FitResult:
-    """Fit several spectra of the same person with shared parameters: two force levels, or force and displacement.
+    """Fit several spectra of the same person with shared parameters: two force levels, or force and
+    displacement.
 
         together = jm.fit_joint({"low": low, "high": high}, separate=("noise_K_w",))
         together["k_w"]
 
-    Minimises `½ Σ_targets Σ_k r_k² + ½ Σ_j θ_j²`, r as in `fit`, in linear response, from many starts; then with the
-    nonlinear model's correction to every target's spectrum. A parameter of one name is the same number in all tasks that
-    have it; one that only one task has belongs to that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's own.
-    Not for two spectra of one recording ("standard" and "slow"): its data would count twice; a notice says so.
+    Minimises `½ Σ_targets Σ_k r_k² + ½ Σ_j θ_j²`, r as in `fit`, in linear response, from many
+    starts; then with the nonlinear model's correction to every target's spectrum. A parameter of
+    one name is the same number in all tasks that have it; one that only one task has belongs to
+    that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's own. Not for two spectra of one
+    recording ("standard" and "slow"): its data would count twice; a notice says so.
 
     **Arguments:**
 
     - `targets` {name: target, in any form that `fit` takes} (of one: the fit of that)
-    - `tasks` {name: task} (`task_for` of each target by default), whose values are the prior's centre and whose spectrum
-      settings the target's replace
+    - `tasks` {name: task} (`task_for` of each target by default), whose values are the prior's
+      centre and whose spectrum settings the target's replace
     - `separate`: names of parameters that have a value for each target, then called "c_w@high"
-    - `proportional`: names that keep the ratio which their values have in the tasks (as `at_level` sets them)
+    - `proportional`: names that keep the ratio which their values have in the tasks (as `at_level`
+      sets them)
     - `free`: names to fit, "P_w@high" for one target's (default as in `fit`)
     - `fix` {name or "name@target": value}
     - `noise` of all tasks
     - `starts`: as in `fit`
     - `seeds` of the nonlinear correction (0: none)
-    - `check_seeds`: fresh seeds of the nonlinear model for each reported spectrum (0: linear response times the correction)
-    - `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`, `increments`, `progress`: as in `fit`
-    - `mean_force` {target: (value, sd)} [N]: means as further data, of tasks that you have scaled (`at_force`). By default,
-      if no `tasks` are given, the means that the targets state in newtons: then all tasks are scaled by one number, to the
-      first of these means, and every target that states a mean has a free P_w. Where one target is of a moved insertion,
-      the masses are not scaled, and are free in all tasks
-    - `rungs`: how many richer models may be tried where the base model does not describe the data (`on_rung`; all targets
-      get the same one). Not with `tasks`
+    - `check_seeds`: fresh seeds of the nonlinear model for each reported spectrum (0: linear
+      response times the correction)
+    - `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`, `increments`,
+      `progress`: as in `fit`
+    - `mean_force` {target: (value, sd)} [N]: means as further data, of tasks that you have scaled
+      (`at_force`). By default, if no `tasks` are given, the means that the targets state in
+      newtons: then all tasks are scaled by one number, to the first of these means, and every
+      target that states a mean has a free P_w. Where one target is of a moved insertion, the masses
+      are not scaled, and are free in all tasks
+    - `rungs`: how many richer models may be tried where the base model does not describe the data
+      (`on_rung`; all targets get the same one). Not with `tasks`
     - `answer`: as in `fit`
 
-    **Returns:** a `FitResult` with a part for each target; a fit that fails is one, too, and says why.
+    **Returns:** a `FitResult` with a part for each target; a fit that fails is one, too, and says
+    why.
 
-    **Raises:** `ValueError` for no targets, names that no target, task or parameter has, tasks that contradict
-    each other in what they share, and what `fit` refuses.
+    **Raises:** `ValueError` for no targets, names that no target, task or parameter has, tasks that
+    contradict each other in what they share, and what `fit` refuses.
     """
-    options = FitOptions(free=free, fix=fix, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds, key=key,
-                         bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
-                         max_steps=max_steps, increments=increments)  # fmt: skip
+    options = FitOptions(
+        free=free,
+        fix=fix,
+        residual=residual,
+        starts=starts,
+        seeds=seeds,
+        check_seeds=check_seeds,
+        key=key,
+        bounds=bounds,
+        priors=priors,
+        coefficient_of_variation=coefficient_of_variation,
+        max_steps=max_steps,
+        increments=increments,
+    )
     loaded = _loaded(targets, tasks or {})
     for argument, named in (("tasks", tasks or {}), ("mean_force", mean_force or {})):
         for name in named:
             if name not in loaded:
-                raise ValueError(f"{argument}: no target is called {name!r}: {choices(name, loaded)}")
+                raise ValueError(
+                    f"{argument}: no target is called {name!r}: {choices(name, loaded)}"
+                )
     if rungs and (tasks or rungs >= len(RUNGS)):
-        raise ValueError(f"rungs = {rungs}: give at most {len(RUNGS) - 1}, and no tasks: they are their own models")
-    moved = {name: found for name, given in targets.items() if (found := recordings_of(given, (tasks or {}).get(name)))}
+        raise ValueError(
+            f"rungs = {rungs}: give at most {len(RUNGS) - 1}, and no tasks: they are their own"
+            " models"
+        )
+    moved = {
+        name: found
+        for name, given in targets.items()
+        if (found := recordings_of(given, (tasks or {}).get(name)))
+    }
 
     def all_models(loaded: dict[str, Target], options: FitOptions) -> tuple[Plan, Models]:
         """The fit of the base model, and of the richer ones."""
-        base, means, carried = _models(loaded, tasks or {}, noise, proper_values(fix)), mean_force, ()
+        base, means, carried = (
+            _models(loaded, tasks or {}, noise, proper_values(fix)),
+            mean_force,
+            (),
+        )
         if means is None and not tasks and "P_w" not in map(base_of, fix or ()):
             base, means, factor = _at_means(base, loaded)
             carried, options = tuple(means), dataclasses.replace(options, carried=factor)
@@ -128,7 +159,11 @@ def fit_joint(
             options.progress(ANEW, 0.0)
             fitted = dict(zip(loaded, muscles, strict=True))
             again = loaded | {name: seen_with(fitted[name], found) for name, found in moved.items()}
-            return None if all(alike(loaded[name], again[name]) for name in moved) else all_models(again, options)
+            return (
+                None
+                if all(alike(loaded[name], again[name]) for name in moved)
+                else all_models(again, options)
+            )
 
         return plan_at(0), Models(rungs, plan_at, renewed=renewed if moved else None)
 
@@ -140,14 +175,21 @@ def fit_joint(
 
 
 def _far_from_means(result: FitResult) -> tuple[str, ...]:
-    """What to say where the tasks that were given have another mean force than the targets state."""
+    """What to say where the tasks that were given have another mean force than the targets
+    state."""
     found = []
     for name, part in result.parts.items():
-        stated, own = part.target.mean_force, result.derived.get(f"mean@{name}" if len(result.parts) > 1 else "mean")
+        stated, own = (
+            part.target.mean_force,
+            result.derived.get(f"mean@{name}" if len(result.parts) > 1 else "mean"),
+        )
         if stated is not None and own is not None and abs(own.value - stated[0]) > FAR * stated[0]:
-            found.append(f"{name}: the fitted muscle pulls with {own.value:.3g} N, the recording with {stated[0]:.3g} N. "
-                         "With tasks= the mean force is no datum: scale the tasks (jaxmuscle.at_force), and give mean_force="
-                         f"{{{name!r}: (mean, sd)}}. All newtons here are those of another muscle")  # fmt: skip
+            found.append(
+                f"{name}: the fitted muscle pulls with {own.value:.3g} N, the recording with"
+                f" {stated[0]:.3g} N. With tasks= the mean force is no datum: scale the tasks"
+                f" (jaxmuscle.at_force), and give mean_force={{{name!r}: (mean, sd)}}. All newtons"
+                " here are those of another muscle"
+            )
     return tuple(found)
 
 
@@ -165,31 +207,56 @@ def planned_jointly(
     `carried`: the targets whose P_w is free, too, since it follows from their mean force.
     """
     separate, proportional = tuple(map(proper, separate)), tuple(map(proper, proportional))
-    bounds, priors, means = dict(options.bounds or {}), dict(options.priors or {}), dict(mean_force or {})
+    bounds, priors, means = (
+        dict(options.bounds or {}),
+        dict(options.priors or {}),
+        dict(mean_force or {}),
+    )
     check_shared(tasks, separate, proportional)
     local = _local_free(
-        tasks, targets, None if options.free is None else tuple(options.free), options.fix or (), tuple(carried)
+        tasks,
+        targets,
+        None if options.free is None else tuple(options.free),
+        options.fix or (),
+        tuple(carried),
     )
     names, moved = joint_names(local, tasks, separate), _any_moved(targets)
     known = list(dict.fromkeys(joint for of in names.values() for joint in of.values()))
     _check_known("bounds", bounds, known)
     _check_known("priors", priors, known)
     plans = {
-        name: planned(tasks[name], target, dataclasses.replace(
-            options, free=local[name], fix=None, bounds=_own(bounds, names[name]), priors=_own(priors, names[name]),
-            mean_force=means.get(name)), moved=moved)
+        name: planned(
+            tasks[name],
+            target,
+            dataclasses.replace(
+                options,
+                free=local[name],
+                fix=None,
+                bounds=_own(bounds, names[name]),
+                priors=_own(priors, names[name]),
+                mean_force=means.get(name),
+            ),
+            moved=moved,
+        )
         for name, target in targets.items()
-    }  # fmt: skip
+    }
     first = next(iter(plans.values()))
     if len(plans) == 1:
         return first
     problem = FitProblem.shared({name: plan.problem for name, plan in plans.items()}, names)
-    settings = first.settings | settings_of(problem, bounds) | {
-        "separate": list(separate), "proportional": list(proportional),
-        "coefficient_of_variation": {n: p.settings["coefficient_of_variation"] for n, p in plans.items()},
-        "mean_force": {n: p.settings["mean_force"] for n, p in plans.items()},
-        "spectrum": {n: p.settings["spectrum"] for n, p in plans.items()},
-    }  # fmt: skip
+    settings = (
+        first.settings
+        | settings_of(problem, bounds)
+        | {
+            "separate": list(separate),
+            "proportional": list(proportional),
+            "coefficient_of_variation": {
+                n: p.settings["coefficient_of_variation"] for n, p in plans.items()
+            },
+            "mean_force": {n: p.settings["mean_force"] for n, p in plans.items()},
+            "spectrum": {n: p.settings["spectrum"] for n, p in plans.items()},
+        }
+    )
     return first._replace(problem=problem, settings=settings)
 
 
@@ -207,15 +274,23 @@ def _any_moved(targets: Mapping[str, Target]) -> bool:
     return any(target.stiffness is not None for target in targets.values())
 
 
-def _models(targets: dict[str, Target], tasks: Mapping[str, AbstractTask], noise: Any, fix: dict[str, float]) -> Tasks:
+def _models(
+    targets: dict[str, Target], tasks: Mapping[str, AbstractTask], noise: Any, fix: dict[str, float]
+) -> Tasks:
     """Every target's task with its noise, its fixed values and the target's settings."""
-    found, fixed = {}, {t: {base_of(n): v for n, v in fix.items() if target_of(n) in ("", t)} for t in targets}
+    found, fixed = (
+        {},
+        {t: {base_of(n): v for n, v in fix.items() if target_of(n) in ("", t)} for t in targets},
+    )
     for name, target in targets.items():
         task = tasks[name] if name in tasks else task_for(target)
         check_quantity(task, target, name, f"give tasks={{{name!r}: ...}}")
         found[name] = with_noise(task.with_parts(settings=target.settings), noise, fixed[name])
     held = {name: _holders("fix", name, found) for name in fix}
-    return {t: task.replace(**{base_of(n): fix[n] for n in fix if t in held[n]}) for t, task in found.items()}
+    return {
+        t: task.replace(**{base_of(n): fix[n] for n in fix if t in held[n]})
+        for t, task in found.items()
+    }
 
 
 def _holders(argument: str, name: str, tasks: Tasks) -> list[str]:
@@ -223,7 +298,11 @@ def _holders(argument: str, name: str, tasks: Tasks) -> list[str]:
     base, target = base_of(name), target_of(name)
     if target and target not in tasks:
         raise ValueError(f"{argument}: {name!r} names no target: {choices(target, tasks)}")
-    known = tasks[target].parameter_names if target else dict.fromkeys(n for t in tasks.values() for n in t.parameter_names)
+    known = (
+        tasks[target].parameter_names
+        if target
+        else dict.fromkeys(n for t in tasks.values() for n in t.parameter_names)
+    )
     if base not in known:
         whose = f"task {target!r} has no parameter" if target else "no task has a parameter"
         raise ValueError(f"{argument}: {whose} {base!r}: {choices(base, known)}")
@@ -231,26 +310,40 @@ def _holders(argument: str, name: str, tasks: Tasks) -> list[str]:
 
 
 def _local_free(
-    tasks: Tasks, targets: dict[str, Target], free: Iterable[str] | None, fix: Iterable[str], carried: Iterable[str]
+    tasks: Tasks,
+    targets: dict[str, Target],
+    free: Iterable[str] | None,
+    fix: Iterable[str],
+    carried: Iterable[str],
 ) -> dict[str, tuple[str, ...]]:
     """The free parameters of every target's task."""
     found, moved = {}, _any_moved(targets)
-    fixed, wanted = ({n: _holders(argument, n, tasks) for n in names or ()} for argument, names in
-                     (("fix", fix), ("free", free)))  # fmt: skip
+    fixed, wanted = (
+        {n: _holders(argument, n, tasks) for n in names or ()}
+        for argument, names in (("fix", fix), ("free", free))
+    )
     for t, task in tasks.items():
         here = [base_of(n) for n, holders in wanted.items() if t in holders]
         if free is not None and not here:
-            raise ValueError(f"free: none of these belongs to the task of target {t!r}: free one, or leave the target out")
+            raise ValueError(
+                f"free: none of these belongs to the task of target {t!r}: free one, or leave the"
+                " target out"
+            )
         held = {base_of(n): 0.0 for n, holders in fixed.items() if t in holders}
         found[t] = free_names(task, None if free is None else here, held, targets[t], moved=moved)
         found[t] += ("P_w",) if t in carried and "P_w" not in found[t] else ()
     return found
 
 
-def _at_means(tasks: Tasks, targets: dict[str, Target]) -> tuple[Tasks, dict[str, tuple[float, float]], float | None]:
-    """All tasks scaled by one number to the first mean force that a target states, each P_w to its own; means, number."""
+def _at_means(
+    tasks: Tasks, targets: dict[str, Target]
+) -> tuple[Tasks, dict[str, tuple[float, float]], float | None]:
+    """All tasks scaled by one number to the first mean force that a target states, each P_w to its
+    own; means, number."""
     stated = {
-        name: t.mean_force for name, t in targets.items() if t.mean_force is not None and tasks[name].output_unit == "N"
+        name: t.mean_force
+        for name, t in targets.items()
+        if t.mean_force is not None and tasks[name].output_unit == "N"
     }
     if not stated or not all(is_scalable(task.muscle) for task in tasks.values()):
         return tasks, {}, None
@@ -258,8 +351,14 @@ def _at_means(tasks: Tasks, targets: dict[str, Target]) -> tuple[Tasks, dict[str
     factor = float(at_force(tasks[first], mean)["P_w"]) / float(tasks[first]["P_w"])
     scaled = {name: times_force(task, factor) for name, task in tasks.items()}
     if _any_moved(targets):  # displacements are known: masses are no scale
-        scaled = {name: task.replace(**{m: tasks[name][m] for m in MASSES}) for name, task in scaled.items()}
-    own = {name: scaled[name].replace(P_w=float(scaled[name]["P_w"]) * value / mean) for name, (value, _) in stated.items()}
+        scaled = {
+            name: task.replace(**{m: tasks[name][m] for m in MASSES})
+            for name, task in scaled.items()
+        }
+    own = {
+        name: scaled[name].replace(P_w=float(scaled[name]["P_w"]) * value / mean)
+        for name, (value, _) in stated.items()
+    }
     return scaled | own, stated, factor
 
 
@@ -271,5 +370,10 @@ def _check_known(argument: str, given: Mapping[str, Any], known: list[str]) -> N
 
 
 def _own(given: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
-    """What is given for one target's parameters: by joint name, else by the parameter's own name."""
-    return {local: given.get(joint, given.get(local)) for local, joint in names.items() if joint in given or local in given}
+    """What is given for one target's parameters: by joint name, else by the parameter's own
+    name."""
+    return {
+        local: given.get(joint, given.get(local))
+        for local, joint in names.items()
+        if joint in given or local in given
+    }

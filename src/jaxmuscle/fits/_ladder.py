@@ -35,8 +35,8 @@ HEAD = "models tried, by formula alone (-> the result)"
 class Rung(NamedTuple):
     """A model that was tried: its `number` on the ladder and `model` in words; what it reached.
 
-    `aic`, `-2 ln L + 2 p` with p, `parameters`, the effective number; chi² per bin and `p` of the verdict; whether it was
-    `chosen`.
+    `aic`, `-2 ln L + 2 p` with p, `parameters`, the effective number; chi² per bin and `p` of the
+    verdict; whether it was `chosen`.
     """
 
     number: int
@@ -58,7 +58,8 @@ class Rung(NamedTuple):
 
 
 class Climbed(NamedTuple):
-    """A rung that was fitted: its plan, the stages of its search, what is known of the scatter, where it ended."""
+    """A rung that was fitted: its plan, the stages of its search, what is known of the scatter,
+    where it ended."""
 
     plan: Plan
     stages: list[Stage]
@@ -68,12 +69,16 @@ class Climbed(NamedTuple):
 
 
 def heading(datum: str) -> str:
-    """The head of the table of models; `datum`, what chi² is counted for: a bin, or else any number of the data."""
+    """The head of the table of models; `datum`, what chi² is counted for: a bin, or else any number
+    of the data."""
     return f"{HEAD:<46}{f'chi2/{datum}':>10}{'p':>9}{'AIC':>9}"
 
 
-def gains(ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin") -> tuple[str, ...]:
-    """What every part of the chosen model gains over the best model without it, in sentences; and what such a number says.
+def gains(
+    ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin"
+) -> tuple[str, ...]:
+    """What every part of the chosen model gains over the best model without it, in sentences; and
+    what such a number says.
 
     `describes`: whether the chosen model describes the data; `datum`, what chi² is counted for.
     """
@@ -82,42 +87,59 @@ def gains(ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin
     said = tuple(_gain(climbed[:i], after, datum) for i, after in enumerate(climbed) if i)
     if not said:
         return ()
-    meaning = ("the AIC weighs how well a model fits against its number of parameters: lower is better. A difference of "
-               f"{ALIKE:g} or less says nothing. jaxmuscle compare is stricter: it needs at least 6, and the richer model "
-               "must also predict bins better that were left out of its fit. The AIC is no p-value")  # fmt: skip
+    meaning = (
+        "the AIC weighs how well a model fits against its number of parameters: lower is better. A"
+        f" difference of {ALIKE:g} or less says nothing. jaxmuscle compare is stricter: it needs at"
+        " least 6, and the richer model must also predict bins better that were left out of its"
+        " fit. The AIC is no p-value"
+    )
     if any(after.aic > before.aic for before, after in itertools.pairwise(climbed)) and number > 0:
-        meaning += (". A richer model can fit worse here, since models with activation or tremor keep stiffness and damping "
-                    "nearer to their usual values")  # fmt: skip
+        meaning += (
+            ". A richer model can fit worse here, since models with activation or tremor keep"
+            " stiffness and damping nearer to their usual values"
+        )
     if describes is False:
-        meaning += (". No model that was tried describes the data: then a lower AIC says that a model misses less, not that "
-                    "the muscle has this part")  # fmt: skip
+        meaning += (
+            ". No model that was tried describes the data: then a lower AIC says that a model"
+            " misses less, not that the muscle has this part"
+        )
     return (*said, meaning)
 
 
 def passed_over(ladder: tuple[Rung, ...]) -> tuple[str, ...]:
     """Which models between those of a table are missing there, and why, in sentences."""
-    return tuple(f"model {before.number} already describes the data, so model {number} was not tried. But the harmonic of "
-                 f"model {before.number} is significant (p < {SIGNIFICANT:g}) and may be a tremor, so model {after.number} "
-                 "was tried as well"
-                 for before, after in itertools.pairwise(ladder) if before.p >= ADEQUATE
-                 for number in range(before.number + 1, after.number))  # fmt: skip
+    return tuple(
+        f"model {before.number} already describes the data, so model {number} was not tried. But"
+        f" the harmonic of model {before.number} is significant (p < {SIGNIFICANT:g}) and may be a"
+        f" tremor, so model {after.number} was tried as well"
+        for before, after in itertools.pairwise(ladder)
+        if before.p >= ADEQUATE
+        for number in range(before.number + 1, after.number)
+    )
 
 
 def _gain(poorer: tuple[Rung, ...], after: Rung, datum: str) -> str:
     """AIC and chi² of a model against those of the best of the poorer ones."""
     last, best = poorer[-1], min(poorer, key=lambda rung: rung.aic)
-    added = " and ".join("with a harmonic" if n == 0 else rung_name(n) for n in range(last.number + 1, after.number + 1))
+    added = " and ".join(
+        "with a harmonic" if n == 0 else rung_name(n)
+        for n in range(last.number + 1, after.number + 1)
+    )
     change = after.aic - best.aic
     against = "" if best is last else f" against the best model before ({best.model})"
-    return (f"{added} the AIC {'falls' if change < 0 else 'rises'} by {abs(change):.1f}{against} (chi2 per {datum} "
-            f"{after.chi2_per_bin:.2f} instead of {best.chi2_per_bin:.2f})")  # fmt: skip
+    return (
+        f"{added} the AIC {'falls' if change < 0 else 'rises'} by {abs(change):.1f}{against} (chi2"
+        f" per {datum} {after.chi2_per_bin:.2f} instead of {best.chi2_per_bin:.2f})"
+    )
 
 
 def options_for(task: AbstractTask, options: FitOptions) -> FitOptions:
     """How one of the models is fitted: a harmonic that it does not have is not fixed."""
     if float(task.harmonic.amplitude) > 0:
         return options
-    return dataclasses.replace(options, fix={n: value for n, value in (options.fix or {}).items() if n not in HARMONIC})
+    return dataclasses.replace(
+        options, fix={n: value for n, value in (options.fix or {}).items() if n not in HARMONIC}
+    )
 
 
 Descend = Callable[[Plan, np.ndarray, list[Stage]], Any]
@@ -126,8 +148,9 @@ Descend = Callable[[Plan, np.ndarray, list[Stage]], Any]
 class Models(NamedTuple):
     """The models that may be tried: up to which rung, how each is fitted, and from which rung on.
 
-    `base` and `plan_of`, of one target: the task of the base model, and how another is fitted. `renewed`: of moved records,
-    what the muscles that were fitted make of their targets; None where that says nothing new.
+    `base` and `plan_of`, of one target: the task of the base model, and how another is fitted.
+    `renewed`: of moved records, what the muscles that were fitted make of their targets; None where
+    that says nothing new.
     """
 
     top: int
@@ -138,12 +161,16 @@ class Models(NamedTuple):
     renewed: "Callable[[tuple[AbstractTask, ...]], tuple[Plan, Models] | None] | None" = None
 
 
-def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed], None]) -> tuple[Rung, ...]:
-    """Fit the first model and the next ones until one is adequate; `keep` gets each that is the best so far.
+def climb(
+    first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed], None]
+) -> tuple[Rung, ...]:
+    """Fit the first model and the next ones until one is adequate; `keep` gets each that is the
+    best so far.
 
-    The best has the lowest AIC. A rung that gains nothing is left out, and the next one is tried. An adequate model is no
-    end in two cases, and a further one is then taken if its AIC is lower by more than 2: noise alone beside which the
-    spectrum shows a significant line, for which the harmonic is tried; and a significant harmonic, for which the tremor is.
+    The best has the lowest AIC. A rung that gains nothing is left out, and the next one is tried.
+    An adequate model is no end in two cases, and a further one is then taken if its AIC is lower by
+    more than 2: noise alone beside which the spectrum shows a significant line, for which the
+    harmonic is tried; and a significant harmonic, for which the tremor is.
     """
     tried: list[Climbed] = []
     best: Climbed | None = None
@@ -158,7 +185,9 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
         plan = plan._replace(settings=plan.settings | {"starts": len(points)})
         stages: list[Stage] = []
         begin, share = place * DESCENDED / len(numbers), DESCENDED / len(numbers)
-        telling = _telling(plan, f"model {number} (of models 0 to {models.top})", begin, begin + share)
+        telling = _telling(
+            plan, f"model {number} (of models 0 to {models.top})", begin, begin + share
+        )
         telling.problem.tell(rung_name(number), 0.0)
         known = descend(telling, points, stages)
         if known is None:
@@ -177,17 +206,22 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
 
 
 def _due(best: Climbed, number: int, models: Models) -> int | None:
-    """Which model is tried after this one, where the best one describes the data; of several targets none."""
+    """Which model is tried after this one, where the best one describes the data; of several
+    targets none."""
     if models.base is None:
         return None
     if number == QUIET:
-        line = float(models.base.harmonic.amplitude) > 0 and p_of_line_left_out(best.ended) < SIGNIFICANT
+        line = (
+            float(models.base.harmonic.amplitude) > 0
+            and p_of_line_left_out(best.ended) < SIGNIFICANT
+        )
         return number + 1 if line else None
     return TREMOR if number < TREMOR <= models.top and _has_line(best) else None
 
 
 def _telling(plan: Plan, which: str, begin: float, end: float) -> Plan:
-    """The plan of one of several models: its progress says which one it is, and goes from `begin` to `end` of the whole."""
+    """The plan of one of several models: its progress says which one it is, and goes from `begin`
+    to `end` of the whole."""
     tell = plan.problem.tell
 
     def own(text: str, share: float) -> None:
@@ -205,7 +239,8 @@ def _has_line(found: Climbed) -> bool:
 
 
 def _warm(plan: Plan, best: Climbed) -> Float[np.ndarray, "starts free"]:
-    """Starts of a richer model: for the most part what it shares with the best one begins where that ended."""
+    """Starts of a richer model: for the most part what it shares with the best one begins where
+    that ended."""
     before, known = best.plan.problem, dict[str, float]()
     for part, task in zip(before.parts, before.tasks_at(best.ended.seen.theta), strict=True):
         for column, name in zip(part.columns, part.coordinates.names, strict=True):
@@ -223,17 +258,23 @@ def rung_of(ended: Endpoint, number: int) -> Rung:
     verdict = ended.adequacy
     assert verdict is not None
     aic, parameters = criterion(ended)
-    numbers = [max(len(part.target.bins) - 1, 0) + (0 if part.points is None else 2 * len(part.points))
-               for part in ended.problem.parts]  # fmt: skip
+    numbers = [
+        max(len(part.target.bins) - 1, 0) + (0 if part.points is None else 2 * len(part.points))
+        for part in ended.problem.parts
+    ]
     return Rung(number, rung_name(number), aic, parameters, verdict.chi2 / sum(numbers), verdict.p)
 
 
 def criterion(ended: Endpoint) -> tuple[float, float]:
     """AIC of the likelihood where a fit ended, and the effective number of parameters."""
     found, precision = ended.found, np.linalg.pinv(ended.scatter, rcond=1e-9, hermitian=True)
-    parameters = effective_parameters(found.jacobian.T @ precision @ found.jacobian, ended.problem.prior)
+    parameters = effective_parameters(
+        found.jacobian.T @ precision @ found.jacobian, ended.problem.prior
+    )
     height = 0.0
-    for part, moments, rows in zip(ended.problem.parts, ended.seen.moments, rows_of(ended), strict=True):
+    for part, moments, rows in zip(
+        ended.problem.parts, ended.seen.moments, rows_of(ended), strict=True
+    ):
         residuals = found.residuals[rows]
         if part.target.segments is None:
             height -= 0.5 * float(residuals @ precision[rows, rows] @ residuals)
@@ -252,9 +293,11 @@ def _height(law: Any, power: Any, line: Any) -> Any:
 def line_or_resonance(
     plan: Plan, fitted: AbstractTask, ladder: tuple[Rung, ...], models: Models, descend: Descend
 ) -> tuple[str, ...]:
-    """Whether the rhythm that was found is a line or a narrow resonance, in a sentence, where that is the question.
+    """Whether the rhythm that was found is a line or a narrow resonance, in a sentence, where that
+    is the question.
 
-    It is where a harmonic is significant (`climb` has tried the tremor then), and where a resonance is narrower than a bin.
+    It is where a harmonic is significant (`climb` has tried the tremor then), and where a resonance
+    is narrower than a bin.
     """
     assert models.plan_of is not None  # of one target
     chosen = next(rung for rung in ladder if rung.chosen)
@@ -268,7 +311,10 @@ def line_or_resonance(
         if isinstance(found, ResonantNoise) and float(found.width) < resolution:
             others = parts[:i] + parts[i + 1 :]
             rest = task.with_parts(noise=NoiseSum(others))
-            line = {"harmonic_amplitude": default("harmonic_amplitude"), "harmonic_frequency": float(found.frequency)}
+            line = {
+                "harmonic_amplitude": default("harmonic_amplitude"),
+                "harmonic_frequency": float(found.frequency),
+            }
             aic = _aic_of(models.plan_of(rest.replace(**line)), descend)
             return () if aic is None else (told_apart(aic, chosen.aic),)
     return ()
@@ -287,5 +333,8 @@ def told_apart(line: float, resonance: float) -> str:
     """A line against a resonance by their AIC, in a sentence."""
     said = f"a line of zero width (AIC {line:.1f}) and a resonance (AIC {resonance:.1f})"
     if abs(line - resonance) <= ALIKE:
-        return f"{said} cannot be told apart: whether the rhythm is regular or a tremor remains open; record longer"
+        return (
+            f"{said} cannot be told apart: whether the rhythm is regular or a tremor remains open;"
+            " record longer"
+        )
     return f"{said}: the data prefer the {'line' if line < resonance else 'resonance'}"

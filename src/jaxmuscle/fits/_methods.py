@@ -1,4 +1,5 @@
-"""The paragraph for the methods section of a paper: of a study, and of a fit to one spectrum or to trials of one person."""
+"""The paragraph for the methods section of a paper: of a study, and of a fit to one spectrum or to
+trials of one person."""
 
 import platform
 import re
@@ -21,9 +22,15 @@ if TYPE_CHECKING:
 
 NAMES = {
     "holm": "Holm's method, which bounds the chance of any false positive",
-    "fdr": "the method of Benjamini and Hochberg, which bounds the expected share of false positives",
+    "fdr": (
+        "the method of Benjamini and Hochberg, which bounds the expected share of false positives"
+    ),
 }
-DETREND = {"constant": "mean removed", "linear": "straight line removed", "none": "mean not removed"}
+DETREND = {
+    "constant": "mean removed",
+    "linear": "straight line removed",
+    "none": "mean not removed",
+}
 TESTS = {
     "groups": "groups within each condition by Welch's t test",
     "conditions": "conditions within people by the paired t test",
@@ -36,24 +43,39 @@ def methods_of_study(study: "StudyResult") -> str:
     """People, recordings, spectra, model, fit, statistics and versions, in sentences."""
     s = study.cells[0].target.settings
     window = study.options["reading"].get("window")
-    judged = [result.adequate for result in study.cohort.results.values() if result.adequate is not None]
+    judged = [
+        result.adequate for result in study.cohort.results.values() if result.adequate is not None
+    ]
     rates = [rate for cell in study.cells for rate in cell.rates]
     named = {None: "the steady part of each recording", "all": "each recording as a whole"}
-    part = f"{window[0]:g} s to {window[1]:g} s" if isinstance(window, tuple | list) else named[window]
+    part = (
+        f"{window[0]:g} s to {window[1]:g} s" if isinstance(window, tuple | list) else named[window]
+    )
     whose = "person and condition" if any(study.conditions) else "person"
     noise = "" if study.options["noise"] is None else f" with {study.options['noise']} noise"
     said = [
         f"We analysed {people_in_words(study)}: {trials_in_words(study)}.",
-        f"Recordings (sampled at {range_of(rates)} Hz) were resampled to {s.rate:g} Hz and {_low_pass(s)}; {part} was "
-        "analysed unless another window was specified.",
+        (
+            f"Recordings (sampled at {range_of(rates)} Hz) were resampled to {s.rate:g} Hz and"
+            f" {_low_pass(s)}; {part} was analysed unless another window was specified."
+        ),
         _welch(s),
-        f"Spectra of trials of one {whose} were averaged, weighted by their number of Welch segments. Where trials "
-        "scattered more than expected from these, all errors were widened accordingly.",
-        f"A stochastic rheological muscle model{noise} was fitted to every averaged spectrum, its coefficient of variation "
-        f"and, where recorded in newtons, its mean force (linear response, Levenberg-Marquardt, {study.options['starts']} "
-        "starts, log power weighted by the scatter of Welch's estimate).",
+        (
+            f"Spectra of trials of one {whose} were averaged, weighted by their number of Welch"
+            " segments. Where trials scattered more than expected from these, all errors were"
+            " widened accordingly."
+        ),
+        (
+            f"A stochastic rheological muscle model{noise} was fitted to every averaged spectrum,"
+            " its coefficient of variation and, where recorded in newtons, its mean force (linear"
+            f" response, Levenberg-Marquardt, {study.options['starts']} starts, log power weighted"
+            " by the scatter of Welch's estimate)."
+        ),
         f"All spectra were fitted with the same model ({RUNGS[study.rung]}){_choice(study)}.",
-        f"The model describes {sum(judged)} of {len(judged)} spectra (p >= 0.01); the errors of the others were widened.",
+        (
+            f"The model describes {sum(judged)} of {len(judged)} spectra (p >= 0.01); the errors of"
+            " the others were widened."
+        ),
         *_statistics(study),
         f"{_software(versions())}, scipy {scipy.__version__}, Python {platform.python_version()}.",
     ]
@@ -61,21 +83,36 @@ def methods_of_study(study: "StudyResult") -> str:
 
 
 def methods_of_fit(result: "FitResult") -> str | None:
-    """Data, spectrum, model, fit, verdict, what was assumed, versions; None for several targets and a moved insertion."""
-    if len(result.parts) > 1 or not result.success or not result.only.fitted.size or result.only.stiffness is not None:
+    """Data, spectrum, model, fit, verdict, what was assumed, versions; None for several targets and
+    a moved insertion."""
+    if (
+        len(result.parts) > 1
+        or not result.success
+        or not result.only.fitted.size
+        or result.only.stiffness is not None
+    ):
         return None
     target, set_to = result.target, result.settings
-    fitted = "the spectrum" + ", its coefficient of variation" * bool(set_to.get("coefficient_of_variation"))
+    fitted = "the spectrum" + ", its coefficient of variation" * bool(
+        set_to.get("coefficient_of_variation")
+    )
     fitted += ", the mean force" * (set_to.get("mean_force") is not None)
-    simulated = f", corrected by {set_to['seeds']} simulations" if result.method == "linear" and set_to.get("seeds") else ""
+    simulated = (
+        f", corrected by {set_to['seeds']} simulations"
+        if result.method == "linear" and set_to.get("seeds")
+        else ""
+    )
     checked = f" and checked by {set_to['check_seeds']} new ones" * bool(set_to.get("check_seeds"))
     how = "in linear response" if result.method == "linear" else "by simulation (Monte Carlo)"
     said = [
         _data(result),
         _welch(target.settings),
-        f"A stochastic rheological muscle model ({result.only.model}) was fitted to {' and '.join(fitted.rsplit(', ', 1))} "
-        f"{how} (Levenberg-Marquardt, {set_to['starts']} starts, {set_to['residual']} power weighted by its scatter, seed "
-        f"{result.seed}{simulated}{checked if simulated else ''}).",
+        (
+            f"A stochastic rheological muscle model ({result.only.model}) was fitted to"
+            f" {' and '.join(fitted.rsplit(', ', 1))} {how} (Levenberg-Marquardt,"
+            f" {set_to['starts']} starts, {set_to['residual']} power weighted by its scatter, seed"
+            f" {result.seed}{simulated}{checked if simulated else ''})."
+        ),
         *_tried(result),
         f"The model {result.verdict}.",
         *_assumed(result),
@@ -92,20 +129,33 @@ def _data(result: "FitResult") -> str:
         return f"We analysed the {target.quantity} spectrum {target.name}{segments}."
     lengths = [round(stop - start, 1) for _, start, stop in read]
     several = len(read) > 1
-    averaged = " Their spectra were averaged, weighted by their number of Welch segments." if several else ""
+    averaged = (
+        " Their spectra were averaged, weighted by their number of Welch segments."
+        if several
+        else ""
+    )
     if target.dispersion is not None:
-        averaged += (f" The scatter between trials was {target.dispersion[0]:.2f} ± {target.dispersion[1]:.2f} times what "
-                     "the segments explain; all errors are widened by this factor if it exceeds 1.")  # fmt: skip
-    return (f"We analysed {counted(len(read), 'recording')} of {target.quantity}{segments}, sampled at "
-            f"{range_of([rate for rate, *_ in read])} Hz: a part of {range_of(lengths)} s{' of each' * several}, after the "
-            f"recording had been resampled to {s.rate:g} Hz and {_low_pass(s)}.{averaged}")  # fmt: skip
+        averaged += (
+            f" The scatter between trials was {target.dispersion[0]:.2f} ±"
+            f" {target.dispersion[1]:.2f} times what the segments explain; all errors are widened"
+            " by this factor if it exceeds 1."
+        )
+    return (
+        f"We analysed {counted(len(read), 'recording')} of {target.quantity}{segments}, sampled at"
+        f" {range_of([rate for rate, *_ in read])} Hz: a part of {range_of(lengths)}"
+        f" s{' of each' * several}, after the recording had been resampled to {s.rate:g} Hz and"
+        f" {_low_pass(s)}.{averaged}"
+    )
 
 
 def _tried(result: "FitResult") -> list[str]:
     if len(result.ladder) < 2:
         return []
-    each = "; ".join(f"{rung.model} (chi2 per bin {rung.chi2_per_bin:.2f}, {probability(rung.p)}, AIC {rung.aic:.1f})"
-                     for rung in result.ladder)  # fmt: skip
+    each = "; ".join(
+        f"{rung.model} (chi2 per bin {rung.chi2_per_bin:.2f}, {probability(rung.p)}, AIC"
+        f" {rung.aic:.1f})"
+        for rung in result.ladder
+    )
     chosen = next(rung.model for rung in result.ladder if rung.chosen)
     return [f"Models were tried from the simplest on: {each}. We report the fit of: {chosen}."]
 
@@ -114,25 +164,39 @@ def _assumed(result: "FitResult") -> list[str]:
     """Priors of what was free, and the values of what was not."""
     centre, sd = (result.settings.get(name, {}) for name in ("prior_centre", "prior_sd"))
     units = {name: f" {row.unit}" * (row.unit != "1") for name, row in PARAMETERS.items()}
-    priors = ", ".join(f"{name} {value:.4g}{units.get(name, '')} ({sd[name]:.2g})"
-                       for name, value in centre.items() if sd.get(name) is not None)  # fmt: skip
+    priors = ", ".join(
+        f"{name} {value:.4g}{units.get(name, '')} ({sd[name]:.2g})"
+        for name, value in centre.items()
+        if sd.get(name) is not None
+    )
     silent = float(result.task.harmonic.amplitude) == 0
-    held = [f"{name} = {p.value:.4g}{units.get(name, '')}" for name, p in result.parameters.items()
-            if not p.free and not (silent and name.startswith("harmonic_"))]  # fmt: skip
-    stated = f"Priors (of positive parameters log-normal) had these centres (standard deviations): {priors}."
+    held = [
+        f"{name} = {p.value:.4g}{units.get(name, '')}"
+        for name, p in result.parameters.items()
+        if not p.free and not (silent and name.startswith("harmonic_"))
+    ]
+    stated = (
+        "Priors (of positive parameters log-normal) had these centres (standard deviations):"
+        f" {priors}."
+    )
     return [stated] * bool(priors) + ([f"Held fixed were {', '.join(held)}."] if held else [])
 
 
 def _welch(s: SpectrumSettings) -> str:
-    return (f"Power spectra were estimated by Welch's method ({_window(s)}, {s.length} samples, {100 * s.overlap:g} % "
-            f"overlap, {DETREND[s.detrend]}) from {s.frequency[0]:.2f} to {s.frequency[-1]:.2f} Hz.")  # fmt: skip
+    return (
+        f"Power spectra were estimated by Welch's method ({_window(s)}, {s.length} samples,"
+        f" {100 * s.overlap:g} % overlap, {DETREND[s.detrend]}) from {s.frequency[0]:.2f} to"
+        f" {s.frequency[-1]:.2f} Hz."
+    )
 
 
 def _low_pass(s: SpectrumSettings) -> str:
     if s.filter_cutoff is None:
         return "not low-pass filtered"
     ways = "forwards and backwards" if s.filter_direction == "both" else "forwards"
-    return f"low-pass filtered (Butterworth, order {s.filter_order}, {s.filter_cutoff:g} Hz, {ways})"
+    return (
+        f"low-pass filtered (Butterworth, order {s.filter_order}, {s.filter_cutoff:g} Hz, {ways})"
+    )
 
 
 def _software(numbers: dict[str, str]) -> str:
@@ -146,8 +210,10 @@ def _window(s: SpectrumSettings) -> str:
 def _choice(study: "StudyResult") -> str:
     if len(study.aic) < 2:
         return ""
-    return (f", of the models tried ({'; '.join(RUNGS[n] for n in study.aic)}) the one with the lowest AIC summed over all "
-            "spectra; groups and conditions had no part in this choice")  # fmt: skip
+    return (
+        f", of the models tried ({'; '.join(RUNGS[n] for n in study.aic)}) the one with the lowest"
+        " AIC summed over all spectra; groups and conditions had no part in this choice"
+    )
 
 
 def _statistics(study: "StudyResult") -> list[str]:
@@ -157,16 +223,26 @@ def _statistics(study: "StudyResult") -> list[str]:
     families = Counter(d.kind for d in found)
     tests = "; ".join(f"{TESTS[kind]} ({counted(n, 'comparison')})" for kind, n in families.items())
     correction = NAMES.get(study.options["correction"])
-    p = (f"p-values were corrected by {correction}, for all comparisons of the same kind together" if correction
-         else "p-values are not corrected for the number of comparisons")  # fmt: skip
+    p = (
+        f"p-values were corrected by {correction}, for all comparisons of the same kind together"
+        if correction
+        else "p-values are not corrected for the number of comparisons"
+    )
     left = [d.left_out for d in found if d.left_out]
     selected = (
-        [f"A quantity that a person's fit does not determine was left out for that person (in {len(left)} of {len(found)} "
-         f"comparisons, {range_of(left)} people), which is a selection."]
-        if left else []
-    )  # fmt: skip
+        [
+            "A quantity that a person's fit does not determine was left out for that person (in"
+            f" {len(left)} of {len(found)} comparisons, {range_of(left)} people), which is a"
+            " selection."
+        ]
+        if left
+        else []
+    )
     return [
-        f"We compared {tests}. In a comparison each person counted once; quantities were not log-transformed. Each "
-        f"{100 * (1 - study.options['alpha']):g} % interval is for a single comparison; {p}.",
+        (
+            f"We compared {tests}. In a comparison each person counted once; quantities were not"
+            f" log-transformed. Each {100 * (1 - study.options['alpha']):g} % interval is for a"
+            f" single comparison; {p}."
+        ),
         *selected,
     ]

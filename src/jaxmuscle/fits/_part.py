@@ -26,15 +26,18 @@ SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
 
 
 def met(further: Mapping[str, float]) -> tuple[str, ...]:
-    """Which of the measured mean and coefficient of variation a fit meets within three standard deviations."""
+    """Which of the measured mean and coefficient of variation a fit meets within three standard
+    deviations."""
     return tuple(name for name, off in further.items() if abs(off) <= MISSED)
 
 
 class Estimate(Shown, eqx.Module):
-    """A number, its `value` in `unit`, with its standard error; `stderr` is None where the data do not determine it.
+    """A number, its `value` in `unit`, with its standard error; `stderr` is None where the data do
+    not determine it.
 
-    `free`, whether it was fitted; `identifiable`, whether the data determine it, None for what was fixed; `interval`,
-    ends of its 95 % interval where that was computed, an end None where the data leave it open.
+    `free`, whether it was fitted; `identifiable`, whether the data determine it, None for what was
+    fixed; `interval`, ends of its 95 % interval where that was computed, an end None where the data
+    leave it open.
     """
 
     value: float
@@ -47,14 +50,27 @@ class Estimate(Shown, eqx.Module):
     def _card(self) -> Card:
         unit = self.unit if self.unit != "1" else ""
         known = [self.error_in_words()] if self.stderr is None else []
-        known += [f"95 % interval {self.interval_in_words()} {unit}".strip()] if self.interval_in_words() else []
-        return Card(f"{self.in_words()} {unit}".strip() + (f" ({'; '.join(known)})" if known else ""))
+        known += (
+            [f"95 % interval {self.interval_in_words()} {unit}".strip()]
+            if self.interval_in_words()
+            else []
+        )
+        return Card(
+            f"{self.in_words()} {unit}".strip() + (f" ({'; '.join(known)})" if known else "")
+        )
 
     def row(self) -> dict[str, Any]:
         """As columns of a table."""
         low, high = (None, None) if self.interval is None else self.interval
-        return {"value": self.value, "stderr": self.stderr, "low": low, "high": high, "unit": self.unit, "free": self.free,
-                "determined": self.stderr is not None}  # fmt: skip
+        return {
+            "value": self.value,
+            "stderr": self.stderr,
+            "low": low,
+            "high": high,
+            "unit": self.unit,
+            "free": self.free,
+            "determined": self.stderr is not None,
+        }
 
     def in_words(self) -> str:
         """The value, rounded to its error where it has one."""
@@ -78,7 +94,8 @@ class Estimate(Shown, eqx.Module):
         return f"above {low}" if low else f"below {high}" if high else "open"
 
     def _digits(self, end: float) -> int:
-        """Three significant digits of an end of the interval, or more where both ends would else look the same."""
+        """Three significant digits of an end of the interval, or more where both ends would else
+        look the same."""
         low, high = self.interval or (None, None)
         if low is None or high is None or end == 0 or not 0 < high - low < math.inf:
             return 3
@@ -88,9 +105,9 @@ class Estimate(Shown, eqx.Module):
 class Start(eqx.Module):
     """One start of a fit: final cost `½ Σ r²` (None if not finite), `success`, steps taken.
 
-    `success`: whether its last step lowered the cost by less than a thousandth of it. `values`, where the free parameters
-    ended, in the order of `settings["free"]`; empty where that is not finite, and of
-    fits that were saved before version 4 of their format.
+    `success`: whether its last step lowered the cost by less than a thousandth of it. `values`,
+    where the free parameters ended, in the order of `settings["free"]`; empty where that is not
+    finite, and of fits that were saved before version 4 of their format.
     """
 
     cost: float | None
@@ -102,15 +119,18 @@ class Start(eqx.Module):
 class FittedPart(eqx.Module):
     """What a fit found of one target.
 
-    Its fitted `task`; `chi2_per_bin` about `fitted` (None without knowledge of the spread) and `rms_log_error`, the
-    standard deviation over the bins of ln(target / fitted); on the target's bins the `fitted` proportional power (of fresh
-    seeds where they were simulated), `harmonic_share` of each bin's power; `residual`, target against fit [standard
-    deviations]; `deviation`, the standard deviation of each log power (None where it is unknown); `components`, what share
-    of each bin's power the parts of the model have in linear response: the `relaxation` of the active tissue under its
-    noise, the `floor` from noise on the passive one, the `harmonic`, the `tremor`, `resonance_2`; `stretch`, time and
-    output of a few simulated seconds; `check`, how far linear response and nonlinear simulation differ; `further`,
-    residuals of the coefficient of variation and of the mean, as far as they are data [standard deviations], positive where
-    the model is above the data; `stiffness`, the fitted dynamic stiffness [N/m] at the frequencies of the target's.
+    Its fitted `task`; `chi2_per_bin` about `fitted` (None without knowledge of the spread) and
+    `rms_log_error`, the standard deviation over the bins of ln(target / fitted); on the target's
+    bins the `fitted` proportional power (of fresh seeds where they were simulated),
+    `harmonic_share` of each bin's power; `residual`, target against fit [standard deviations];
+    `deviation`, the standard deviation of each log power (None where it is unknown); `components`,
+    what share of each bin's power the parts of the model have in linear response: the `relaxation`
+    of the active tissue under its noise, the `floor` from noise on the passive one, the `harmonic`,
+    the `tremor`, `resonance_2`; `stretch`, time and output of a few simulated seconds; `check`, how
+    far linear response and nonlinear simulation differ; `further`, residuals of the coefficient of
+    variation and of the mean, as far as they are data [standard deviations], positive where the
+    model is above the data; `stiffness`, the fitted dynamic stiffness [N/m] at the frequencies of
+    the target's.
     """
 
     target: Target
@@ -134,13 +154,16 @@ class FittedPart(eqx.Module):
 
     @property
     def data(self) -> int:
-        """Numbers that the fit compares: bins less one, as only their shape counts, and two for each
-        frequency of the dynamic stiffness (real and imaginary part)."""
-        return max(len(self.fitted) - 1, 0) + (0 if self.stiffness is None else 2 * len(self.stiffness))
+        """Numbers that the fit compares: bins less one, as only their shape counts, and two for
+        each frequency of the dynamic stiffness (real and imaginary part)."""
+        return max(len(self.fitted) - 1, 0) + (
+            0 if self.stiffness is None else 2 * len(self.stiffness)
+        )
 
     @property
     def stiffness_residual(self) -> Complex[np.ndarray, " points"] | None:
-        """Measured less fitted dynamic stiffness, real and imaginary part in standard errors; None where there is none."""
+        """Measured less fitted dynamic stiffness, real and imaginary part in standard errors; None
+        where there is none."""
         if self.stiffness is None or self.target.stiffness is None:
             return None
         measured = self.target.stiffness.known
@@ -148,7 +171,8 @@ class FittedPart(eqx.Module):
 
     @property
     def chi2_per_point(self) -> float | None:
-        """`Σ |stiffness_residual|² / (2 points)`, about 1 where the model describes the dynamic stiffness; or None."""
+        """`Σ |stiffness_residual|² / (2 points)`, about 1 where the model describes the dynamic
+        stiffness; or None."""
         off = self.stiffness_residual
         return None if off is None else float(np.mean(np.abs(off) ** 2) / 2)
 
@@ -157,17 +181,28 @@ class FittedPart(eqx.Module):
         if self.stiffness is None or self.target.stiffness is None:
             return {}
         measured = self.target.stiffness.known
-        return {"frequency_hz": measured.frequency, "real": np.real(measured.value), "imaginary": np.imag(measured.value),
-                "stderr": measured.stderr, "fitted_real": np.real(self.stiffness),
-                "fitted_imaginary": np.imag(self.stiffness)}  # fmt: skip
+        return {
+            "frequency_hz": measured.frequency,
+            "real": np.real(measured.value),
+            "imaginary": np.imag(measured.value),
+            "stderr": measured.stderr,
+            "fitted_real": np.real(self.stiffness),
+            "fitted_imaginary": np.imag(self.stiffness),
+        }
 
     def columns(self) -> dict[str, Any]:
         """What `spectrum.csv` holds, by column."""
-        return {"frequency_hz": self.frequency_hz, "target": self.target.proportional_power, "fitted": self.fitted,
-                "harmonic_share": self.harmonic_share, "residual_sd": self.residual}  # fmt: skip
+        return {
+            "frequency_hz": self.frequency_hz,
+            "target": self.target.proportional_power,
+            "fitted": self.fitted,
+            "harmonic_share": self.harmonic_share,
+            "residual_sd": self.residual,
+        }
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row for each bin: `frequency_hz`, `target` and `fitted` proportional power, `harmonic_share`, `residual_sd`."""
+        """A row for each bin: `frequency_hz`, `target` and `fitted` proportional power,
+        `harmonic_share`, `residual_sd`."""
         return frame(self.columns())
 
     @property
@@ -175,7 +210,9 @@ class FittedPart(eqx.Module):
         """Task and noise in words."""
         parts = [type(noise).__name__ for noise in self.task.noise.components]
         kind = type(self.task).__name__ + " (acceleration)" * (self.task.quantity == "acceleration")
-        return ", ".join([kind, " + ".join(parts), *["activation"] * (self.task.activation is not None)])
+        return ", ".join(
+            [kind, " + ".join(parts), *["activation"] * (self.task.activation is not None)]
+        )
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -184,27 +221,56 @@ class FittedPart(eqx.Module):
             return ()
         off = 100 * self.check["largest_deviation"]
         if "largest_deviation_se" not in self.check:
-            return (f"simulation and closed formula (linear response) differ by at most {off:.2g} % of a bin",)
-        return (f"checked with {self.check['seeds']} new simulations: they differ from the closed formula by at most "
-                f"{off:.2g} % of a bin",)  # fmt: skip
+            return (
+                (
+                    f"simulation and closed formula (linear response) differ by at most {off:.2g} %"
+                    " of a bin"
+                ),
+            )
+        return (
+            (
+                f"checked with {self.check['seeds']} new simulations: they differ from the closed"
+                f" formula by at most {off:.2g} % of a bin"
+            ),
+        )
 
 
 def estimates_to_table(table: dict[str, Estimate]) -> dict[str, Any]:
     """For JSON, which knows no infinite numbers."""
-    return {n: {"value": with_nulls(float(p.value)), "unit": p.unit, "stderr": p.stderr, "free": p.free,
-                "identifiable": p.identifiable, "interval": None if p.interval is None else list(p.interval)}
-            for n, p in table.items()}  # fmt: skip
+    return {
+        n: {
+            "value": with_nulls(float(p.value)),
+            "unit": p.unit,
+            "stderr": p.stderr,
+            "free": p.free,
+            "identifiable": p.identifiable,
+            "interval": None if p.interval is None else list(p.interval),
+        }
+        for n, p in table.items()
+    }
 
 
 def read_estimates(table: dict[str, EstimateTable]) -> dict[str, Estimate]:
     """The reverse of `estimates_to_table`."""
-    return {n: Estimate(np.nan if p.value is None else p.value, p.unit, p.stderr, p.free, p.identifiable, p.interval)
-            for n, p in table.items()}  # fmt: skip
+    return {
+        n: Estimate(
+            np.nan if p.value is None else p.value,
+            p.unit,
+            p.stderr,
+            p.free,
+            p.identifiable,
+            p.interval,
+        )
+        for n, p in table.items()
+    }
 
 
 def part_to_table(part: FittedPart) -> dict[str, Any]:
     """What `fit.json` says of one target."""
-    kind = next((name for name, kind in TASKS.items() if isinstance(part.task, kind)), type(part.task).__name__)
+    kind = next(
+        (name for name, kind in TASKS.items() if isinstance(part.task, kind)),
+        type(part.task).__name__,
+    )
     return {
         "target": part.target.name,
         "provenance": part.target.provenance,
@@ -220,16 +286,19 @@ def part_to_table(part: FittedPart) -> dict[str, Any]:
         "stretch": {"time": with_nulls(part.stretch[0]), "output": with_nulls(part.stretch[1])},
         "check": part.check,
         "further": part.further,
-        "stiffness": None
-        if part.stiffness is None
-        else [np.real(part.stiffness).tolist(), np.imag(part.stiffness).tolist()],
+        "stiffness": (
+            None
+            if part.stiffness is None
+            else [np.real(part.stiffness).tolist(), np.imag(part.stiffness).tolist()]
+        ),
         "target_table": part.target.to_table(whole=True),
         "task_table": task_to_table(part.task),
     }
 
 
 def read_part(table: PartTable, *, whole: bool) -> FittedPart:
-    """The reverse of `part_to_table`; without `whole` task and target may leave out what they do not have."""
+    """The reverse of `part_to_table`; without `whole` task and target may leave out what they do
+    not have."""
     spectrum, stretch, stiffness = table.spectrum, table.stretch, table.stiffness
     target = Target.from_table(table.target_table, whole=whole)
     check_lengths(table, target)
@@ -239,9 +308,13 @@ def read_part(table: PartTable, *, whole: bool) -> FittedPart:
         chi2_per_bin=table.chi2_per_bin,
         rms_log_error=table.rms_log_error,
         **{field: from_nulls(getattr(spectrum, field)) for field in SPECTRUM},
-        components={name: np.asarray(from_nulls(share)) for name, share in spectrum.components.items()},
+        components={
+            name: np.asarray(from_nulls(share)) for name, share in spectrum.components.items()
+        },
         stretch=(from_nulls(stretch.time), from_nulls(stretch.output)),
         check=table.check,
         further=table.further,
-        stiffness=None if stiffness is None else np.array(stiffness[0]) + 1j * np.array(stiffness[1]),
+        stiffness=(
+            None if stiffness is None else np.array(stiffness[0]) + 1j * np.array(stiffness[1])
+        ),
     )

@@ -1,4 +1,5 @@
-"""Perturbed recordings as the target of a fit: the response to the perturbation is taken off by the model that is fitted."""
+"""Perturbed recordings as the target of a fit: the response to the perturbation is taken off by the
+model that is fitted."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -28,20 +29,26 @@ NEAR = 0.1
 ANEW = "subtracting the response to the movement by the model found"
 
 
-def aimed(given: Any, task: AbstractTask | None = None, options: FitOptions | None = None) -> Target:
-    """The target of whatever a fit was given; that of perturbed recordings with the response of the task's muscle."""
+def aimed(
+    given: Any, task: AbstractTask | None = None, options: FitOptions | None = None
+) -> Target:
+    """The target of whatever a fit was given; that of perturbed recordings with the response of the
+    task's muscle."""
     recordings = recordings_of(given, task)
     if not recordings:
         return as_target(given)
     with jax.enable_x64(True):
-        return analysed(recordings, PrescribedLength() if task is None else task, options or FitOptions())
+        return analysed(
+            recordings, PrescribedLength() if task is None else task, options or FitOptions()
+        )
 
 
 def without_rhythm(task: AbstractTask, options: FitOptions) -> AbstractTask:
-    """The task without its harmonic, where the fit may leave that out: nobody asked for it, and the model is a base one.
+    """The task without its harmonic, where the fit may leave that out: nobody asked for it, and the
+    model is a base one.
 
-    A harmonic whose frequency is sought in the noise of the spectrum bends that. It is fitted where the spectrum shows one
-    (docs/perturbed.md).
+    A harmonic whose frequency is sought in the noise of the spectrum bends that. It is fitted where
+    the spectrum shows one (docs/perturbed.md).
     """
     named = {*(options.fix or ()), *(options.priors or ()), *(options.bounds or ())}
     asked = options.free is not None or not named.isdisjoint(HARMONIC)
@@ -51,7 +58,8 @@ def without_rhythm(task: AbstractTask, options: FitOptions) -> AbstractTask:
 
 
 def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) -> Target:
-    """The target with the response of a task's nonlinear muscle taken off, or of the linear one where that is not finite."""
+    """The target with the response of a task's nonlinear muscle taken off, or of the linear one
+    where that is not finite."""
     assert isinstance(muscle, PrescribedLength)
 
     def stiffness(f: np.ndarray) -> np.ndarray:
@@ -64,7 +72,8 @@ def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) ->
 
 
 def alike(one: Target, other: Target) -> bool:
-    """Whether two targets of the same recordings differ by less than a tenth of their scatter, as root mean squares."""
+    """Whether two targets of the same recordings differ by less than a tenth of their scatter, as
+    root mean squares."""
     apart = []
     if one.stiffness is not None and other.stiffness is not None:
         known, again = one.stiffness.known, other.stiffness.known
@@ -72,22 +81,33 @@ def alike(one: Target, other: Target) -> bool:
             return False
         apart.append(np.abs(again.value - known.value) / known.stderr / np.sqrt(2))
     if len(one.bins):
-        level, later = (np.log(t.proportional_power) + np.log(np.mean(np.square(t.coefficient_of_variation or 1.0)))
-                        for t in (one, other))  # fmt: skip
+        level, later = (
+            np.log(t.proportional_power)
+            + np.log(np.mean(np.square(t.coefficient_of_variation or 1.0)))
+            for t in (one, other)
+        )
         apart.append((later - level) / bin_statistics(one).sd)
     return all(np.sqrt(np.mean(np.square(each))) < NEAR for each in apart)
 
 
-def recordings_of(given: object, task: AbstractTask | None = None) -> tuple[PerturbedRecording, ...]:
+def recordings_of(
+    given: object, task: AbstractTask | None = None
+) -> tuple[PerturbedRecording, ...]:
     """The perturbed recordings that a fit was given, for that or any task; none of anything else.
 
-    Files of two channels are read as such only where neither the task nor the displacement says that the insertion is held.
+    Files of two channels are read as such only where neither the task nor the displacement says
+    that the insertion is held.
     """
-    return perturbed_recordings(given, files=task is None or type(task) is PrescribedLength, held=task is None)
+    return perturbed_recordings(
+        given, files=task is None or type(task) is PrescribedLength, held=task is None
+    )
 
 
-def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, options: FitOptions) -> Target:
-    """Their target, with the response by the muscle that fits it: found in a few rounds from the nonparametric one."""
+def analysed(
+    recordings: Sequence[PerturbedRecording], task: AbstractTask, options: FitOptions
+) -> Target:
+    """Their target, with the response by the muscle that fits it: found in a few rounds from the
+    nonparametric one."""
     _check_trials(recordings)
     target, points = perturbed_target(recordings), None
     for _ in range(ROUNDS):
@@ -104,18 +124,32 @@ def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, optio
 
 
 def _check_trials(recordings: Sequence[PerturbedRecording]) -> None:
-    """Refuse a trial whose force does not follow its displacement, though it would be seen to follow as in the others."""
+    """Refuse a trial whose force does not follow its displacement, though it would be seen to
+    follow as in the others."""
     if len(recordings) < 2:
         return
-    each = [one for recording in recordings if (one := perturbed_target((recording,)).stiffness) is not None]
+    each = [
+        one
+        for recording in recordings
+        if (one := perturbed_target((recording,)).stiffness) is not None
+    ]
     for number, own in enumerate(each):
         if own.p_none <= UNSEEN:
             continue
         others = [other for i, other in enumerate(each) if i != number]
-        weight = np.array([np.interp(own.frequency, other.frequency, other.stderr**-2.0) for other in others])
-        value = [np.interp(own.frequency, other.frequency, np.real(other.value)) +
-                 1j * np.interp(own.frequency, other.frequency, np.imag(other.value)) for other in others]  # fmt: skip
+        weight = np.array(
+            [np.interp(own.frequency, other.frequency, other.stderr**-2.0) for other in others]
+        )
+        value = [
+            np.interp(own.frequency, other.frequency, np.real(other.value))
+            + 1j * np.interp(own.frequency, other.frequency, np.imag(other.value))
+            for other in others
+        ]
         usual, error = np.average(value, axis=0, weights=weight), 1 / np.sqrt(weight.sum(axis=0))
-        apart = dataclasses.replace(own, value=own.value - usual, stderr=np.hypot(own.stderr, error))
+        apart = dataclasses.replace(
+            own, value=own.value - usual, stderr=np.hypot(own.stderr, error)
+        )
         if apart.p_none <= UNSEEN:
-            check_seen(own, f"trial {number + 1} of {len(recordings)} ({recordings[number].source})")
+            check_seen(
+                own, f"trial {number + 1} of {len(recordings)} ({recordings[number].source})"
+            )

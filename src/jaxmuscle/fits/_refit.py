@@ -1,4 +1,5 @@
-"""What a refit leaves of residuals, to first order, but with the line of the harmonic sought anew."""
+"""What a refit leaves of residuals, to first order, but with the line of the harmonic sought
+anew."""
 
 from typing import NamedTuple
 
@@ -17,18 +18,21 @@ from jaxmuscle.objective._residuals import Residuals
 from jaxmuscle.response._harmonic_line import line_levels
 
 LINES = 128
-CHUNK = 100  # residuals whose costs are found at a time: what lies in the directions of all lines is large
+# residuals whose costs are found at a time: what lies in the directions of all lines is large
+CHUNK = 100
 STRENGTHS = np.geomspace(0.005, 20.0, 20)
 
 
 class Refit(NamedTuple):
-    """What a refit leaves of residuals, data rows and then those of the prior, with any of several lines as the harmonic.
+    """What a refit leaves of residuals, data rows and then those of the prior, with any of several
+    lines as the harmonic.
 
-    With line i residuals lose `change[i]`, and what lies in `taken[i]`, orthonormal columns, is taken up by the other
-    parameters, at the `penalty` of the frequency's prior. The last line is the fitted one, which changes nothing.
-    `frequency` of each; `used`, the coordinates of amplitude and frequency, none where no line is sought; `prior`, the
-    prior's rows at the fit; `narrow`, which turns residuals into the fewer ones that all this is about: of many rows those
-    directions, orthonormal columns, in which the parameters can move them.
+    With line i residuals lose `change[i]`, and what lies in `taken[i]`, orthonormal columns, is
+    taken up by the other parameters, at the `penalty` of the frequency's prior. The last line is
+    the fitted one, which changes nothing. `frequency` of each; `used`, the coordinates of amplitude
+    and frequency, none where no line is sought; `prior`, the prior's rows at the fit; `narrow`,
+    which turns residuals into the fewer ones that all this is about: of many rows those directions,
+    orthonormal columns, in which the parameters can move them.
     """
 
     change: Float[np.ndarray, "lines all"]
@@ -40,19 +44,27 @@ class Refit(NamedTuple):
     narrow: Float[np.ndarray, "rows all"]
 
     def cost(self, residuals: Float[np.ndarray, "rows all"]) -> Float[np.ndarray, "rows lines"]:
-        """`|(1 - U Uᵀ) (r - change)|²` with the penalty, less `|r|²`; the largest of its terms in single precision."""
+        """`|(1 - U Uᵀ) (r - change)|²` with the penalty, less `|r|²`; the largest of its terms in
+        single precision."""
         own, (_, size, fitted) = residuals @ self.narrow, self.taken.shape
         held = np.einsum("la,lak->lk", self.change, self.taken)
         away = self.change - np.einsum("lak,lk->la", self.taken, held)
         columns = np.transpose(self.taken.astype(np.float32), (1, 2, 0)).reshape(size, -1)
-        cost = np.sum(self.change**2, axis=1) + self.penalty - np.sum(held**2, axis=1) - 2 * own @ away.T
+        cost = (
+            np.sum(self.change**2, axis=1)
+            + self.penalty
+            - np.sum(held**2, axis=1)
+            - 2 * own @ away.T
+        )
         for i in range(0, len(own), CHUNK):
             inside = own[i : i + CHUNK].astype(np.float32) @ columns
             np.square(inside, out=inside)
             cost[i : i + CHUNK] -= inside.reshape(len(inside), fitted, -1).sum(axis=1)
         return cost
 
-    def left(self, residuals: Float[np.ndarray, "rows all"], line: np.ndarray | int = -1) -> Float[np.ndarray, "rows all"]:
+    def left(
+        self, residuals: Float[np.ndarray, "rows all"], line: np.ndarray | int = -1
+    ) -> Float[np.ndarray, "rows all"]:
         """What is left of every row with its line."""
         own = residuals @ self.narrow
         rest = own - self.change[line]
@@ -61,8 +73,11 @@ class Refit(NamedTuple):
         return residuals + (rest - own) @ self.narrow.T
 
 
-def refit_of(problem: FitProblem, objective: Residuals, seen: Expansion, found: Consequences) -> Refit:
-    """Lines of every frequency and strength in place of the fitted one, where a fit would have found them."""
+def refit_of(
+    problem: FitProblem, objective: Residuals, seen: Expansion, found: Consequences
+) -> Refit:
+    """Lines of every frequency and strength in place of the fitted one, where a fit would have
+    found them."""
     names, prior = problem.coordinates.names, np.sqrt(problem.prior)
     free = tuple(names.index(n) for n in HARMONIC if n in names)
     moments, slopes, own = seen.moments[0], seen.slopes[0], objective.parts[0]
@@ -93,7 +108,8 @@ def refit_of(problem: FitProblem, objective: Residuals, seen: Expansion, found: 
     change = np.zeros((lines, count + len(kept) + 1))
     jacobian = np.zeros((*change.shape, len(kept)))
     spread = np.asarray(own.data.sd)
-    # The level of a line is held: the other parameters move the noise alone, and the amplitude follows.
+    # The level of a line is held: the other parameters move the noise alone, and the amplitude
+    # follows.
     level = np.sum(slopes.line, axis=0)[kept] / np.sum(line)
     logs = np.log(total / power)
     change[:, :bins] = (logs - logs.mean(axis=1, keepdims=True)) / spread
@@ -113,16 +129,28 @@ def refit_of(problem: FitProblem, objective: Residuals, seen: Expansion, found: 
     jacobian[:, -1] = -0.5 * prior[a] * level / sd[a]
     theta = seen.theta[f] + np.log(frequency / here) / sd[f]
     rows = np.append(prior[kept] * seen.theta[kept], prior[a] * seen.theta[a])
-    return Refit(change, taken_up(jacobian), problem.prior[f] * (theta**2 - seen.theta[f] ** 2), rows, frequency, free,
-                 np.asarray(block_diag(turn, np.eye(len(rows)))))  # fmt: skip
+    return Refit(
+        change,
+        taken_up(jacobian),
+        problem.prior[f] * (theta**2 - seen.theta[f] ** 2),
+        rows,
+        frequency,
+        free,
+        np.asarray(block_diag(turn, np.eye(len(rows)))),
+    )
 
 
-def _narrowed(objective: Residuals, jacobian: Float[np.ndarray, "rows free"]) -> tuple[np.ndarray, np.ndarray]:
-    """The Jacobian with the many rows of a dynamic stiffness turned into few, and what turns them."""
+def _narrowed(
+    objective: Residuals, jacobian: Float[np.ndarray, "rows free"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The Jacobian with the many rows of a dynamic stiffness turned into few, and what turns
+    them."""
     turns, start = [], 0
     for part in objective.parts:
         points = 0 if part.model.points is None else 2 * len(part.model.points)
-        rows = part.data.further - points + len(part.statistics.sd) - (part.residual == "cumulative")
+        rows = (
+            part.data.further - points + len(part.statistics.sd) - (part.residual == "cumulative")
+        )
         turns.append(np.eye(rows))
         start += rows
         if points:
@@ -135,9 +163,10 @@ def _narrowed(objective: Residuals, jacobian: Float[np.ndarray, "rows free"]) ->
 class Lines(NamedTuple):
     """Lines over the band of a target, as many strengths as frequencies make rows.
 
-    `frequency` of each; `each`, what a mean square of 1 adds to the bins; `square`, the mean square that is tried,
-    from 0.005 to 20 times the noise of the bin where it is strongest; `gain`, the mean square of a harmonic of
-    amplitude √2, and that at one more frequency, of which `last` is what a mean square of 1 adds.
+    `frequency` of each; `each`, what a mean square of 1 adds to the bins; `square`, the mean square
+    that is tried, from 0.005 to 20 times the noise of the bin where it is strongest; `gain`, the
+    mean square of a harmonic of amplitude √2, and that at one more frequency, of which `last` is
+    what a mean square of 1 adds.
     """
 
     frequency: Float[np.ndarray, " lines"]
@@ -150,10 +179,14 @@ class Lines(NamedTuple):
 def over_band(target: Target, least: int) -> Float[np.ndarray, " frequencies"]:
     """Frequencies over the band of a target, two to a bin or more: a line is four bins wide."""
     first, last = float(target.frequency[0]), float(target.frequency[-1])
-    return np.linspace(first, last, max(least, round(2 * (last - first) / target.settings.resolution)))
+    return np.linspace(
+        first, last, max(least, round(2 * (last - first) / target.settings.resolution))
+    )
 
 
-def lines_of(part: Part, task: AbstractTask, noise: Float[np.ndarray, " bins"], last: float) -> Lines:
+def lines_of(
+    part: Part, task: AbstractTask, noise: Float[np.ndarray, " bins"], last: float
+) -> Lines:
     """Lines over the band beside noise of these powers, and one more frequency."""
     frequency = over_band(part.target, LINES)
     levels = line_levels(as_arrays(task), part.target.settings, np.append(frequency, last))
@@ -161,8 +194,13 @@ def lines_of(part: Part, task: AbstractTask, noise: Float[np.ndarray, " bins"], 
     each = each[:, part.chosen]
     square = STRENGTHS[:, None] / np.max(each[:-1] / noise, axis=1)
     often = len(STRENGTHS)
-    return Lines(np.tile(frequency, often), np.tile(each[:-1], (often, 1)), square.reshape(-1),
-                 np.append(np.tile(gain[:-1], often), gain[-1]), each[-1])  # fmt: skip
+    return Lines(
+        np.tile(frequency, often),
+        np.tile(each[:-1], (often, 1)),
+        square.reshape(-1),
+        np.append(np.tile(gain[:-1], often), gain[-1]),
+        each[-1],
+    )
 
 
 def without_fitted(jacobian: Float[np.ndarray, "all fitted"]) -> Float[np.ndarray, "all all"]:
@@ -171,7 +209,12 @@ def without_fitted(jacobian: Float[np.ndarray, "all fitted"]) -> Float[np.ndarra
     return np.eye(len(jacobian)) - basis @ basis.T
 
 
-def taken_up(jacobian: Float[np.ndarray, "*lines all fitted"]) -> Float[np.ndarray, "*lines all fitted"]:
-    """Orthonormal columns that span what the fitted directions take up; zero where two of them are one."""
+def taken_up(
+    jacobian: Float[np.ndarray, "*lines all fitted"],
+) -> Float[np.ndarray, "*lines all fitted"]:
+    """Orthonormal columns that span what the fitted directions take up; zero where two of them are
+    one."""
     basis, size, _ = np.linalg.svd(np.nan_to_num(jacobian), full_matrices=False)
-    return basis * (size > 1e-9 * np.max(size, axis=-1, keepdims=True, initial=1e-300))[..., None, :]
+    return (
+        basis * (size > 1e-9 * np.max(size, axis=-1, keepdims=True, initial=1e-300))[..., None, :]
+    )

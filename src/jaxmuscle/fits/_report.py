@@ -1,4 +1,5 @@
-"""From where a fit ended to its result: success in words, fresh spectrum, standard errors, what is undetermined."""
+"""From where a fit ended to its result: success in words, fresh spectrum, standard errors, what is
+undetermined."""
 
 import itertools
 from typing import Any, NamedTuple
@@ -58,22 +59,25 @@ from ._tables import (
 STRETCH = 5.0
 UNSETTLED = 1e-3
 UNCHECKED = (
-    "not done: the check by new simulations, the test of other frequencies of the harmonic, and its p-value. "
-    "--quick (check_seeds=0) leaves these out, and so does an interruption"
+    "not done: the check by new simulations, the test of other frequencies of the harmonic, and its"
+    " p-value. --quick (check_seeds=0) leaves these out, and so does an interruption"
 )
 TOGETHER = (
-    "fitted by the formula alone: no correction and no check by simulation, no profile and no p-value of the harmonic. For "
-    "these, fit this target alone with the usual settings"
+    "fitted by the formula alone: no correction and no check by simulation, no profile and no"
+    " p-value of the harmonic. For these, fit this target alone with the usual settings"
 )
 
 
 def may_be_elsewhere(share: float) -> str:
-    """Why a harmonic that is elsewhere with this probability has no errors; where it seems small, from where on."""
+    """Why a harmonic that is elsewhere with this probability has no errors; where it seems small,
+    from where on."""
     percent = f"{100 * share:.{0 if share >= 0.1 else 1}f}"
     limit = f" (a probability above {100 * UNSETTLED:g} % is enough for that)"
-    return ("the harmonic may have another frequency, or be too faint to be seen: with a probability of "
-            f"{percent} % it is more than a bin from the frequency shown. So no standard errors are stated for the harmonic"
-            f"{limit if share < 0.1 else ''}")  # fmt: skip
+    return (
+        "the harmonic may have another frequency, or be too faint to be seen: with a probability"
+        f" of {percent} % it is more than a bin from the frequency shown. So no standard errors are"
+        f" stated for the harmonic{limit if share < 0.1 else ''}"
+    )
 
 
 def report_fit(
@@ -85,10 +89,11 @@ def report_fit(
     interrupted: bool = False,
     preliminary: bool = False,
 ) -> FitResult:
-    """The result of a fit that ended at the best point of the last stage; with no `check_seeds` nothing is simulated.
+    """The result of a fit that ended at the best point of the last stage; with no `check_seeds`
+    nothing is simulated.
 
-    Then the second order says whether the linear response holds, unless the result is `preliminary`. `ended` is that point,
-    if it has been looked at already.
+    Then the second order says whether the linear response holds, unless the result is
+    `preliminary`. `ended` is that point, if it has been looked at already.
     """
     problem, final = plan.problem, stages[-1].minima
     first = stages[0].minima
@@ -97,8 +102,14 @@ def report_fit(
         Start(float(c) if np.isfinite(c) else None, bool(ok), int(n), _six_digits(end))
         for c, ok, n, end in zip(first.cost, first.settled, first.steps, ends, strict=True)
     )
-    common = {"method": problem.method, "starts": starts, "seed": plan.seed, "settings": plan.settings,
-              "versions": versions(), "ladder": ladder}  # fmt: skip
+    common = {
+        "method": problem.method,
+        "starts": starts,
+        "seed": plan.seed,
+        "settings": plan.settings,
+        "versions": versions(),
+        "ladder": ladder,
+    }
     if not np.isfinite(final.cost[final.best]):
         return _failed(problem, common, _not_finite(problem))
     ended = Endpoint.of(problem, stages[-1]) if ended is None else ended
@@ -111,42 +122,80 @@ def report_fit(
     except ValueError as error:
         return _failed(problem, common, str(error))
     try:
-        made = [_simulated(problem, part, task, plan.check_seeds) if plan.check_seeds else _expected_only(moments)
-                for part, task, moments in zip(problem.parts, tasks, seen.moments, strict=True)]  # fmt: skip
+        made = [
+            (
+                _simulated(problem, part, task, plan.check_seeds)
+                if plan.check_seeds
+                else _expected_only(moments)
+            )
+            for part, task, moments in zip(problem.parts, tasks, seen.moments, strict=True)
+        ]
     except (SimulationError, ValueError) as error:
         return _failed(problem, common, f"the fitted task cannot be simulated: {error}")
     found = ended.found
-    made = [m._replace(each=m.each._replace(line=np.tile(np.minimum(x.line, np.mean(m.each.power, axis=0)),
-                                                         (len(m.each.mean), 1))))
-            for m, x in zip(made, seen.moments, strict=True)]  # fmt: skip
+    made = [
+        m._replace(
+            each=m.each._replace(
+                line=np.tile(
+                    np.minimum(x.line, np.mean(m.each.power, axis=0)), (len(m.each.mean), 1)
+                )
+            )
+        )
+        for m, x in zip(made, seen.moments, strict=True)
+    ]
     judgement, covariance = ended.adequacy, ended.covariance
     known = Identifiability.of_covariance(covariance)
     success, message = convergence(
         final, found.residuals, found.jacobian, problem.prior, theta, known, starts, plan.max_steps
     )
     if interrupted:
-        success, message = False, f"interrupted after {int(final.steps.max())} steps; this is what had been reached"
-    tables = [derived_table(part, values | _observed(part, m.each), slopes, jackknife(m.each), covariance, known)
-              for part, values, slopes, m in zip(problem.parts, found.values, found.slopes, made, strict=True)]  # fmt: skip
+        success, message = (
+            False,
+            f"interrupted after {int(final.steps.max())} steps; this is what had been reached",
+        )
+    tables = [
+        derived_table(
+            part, values | _observed(part, m.each), slopes, jackknife(m.each), covariance, known
+        )
+        for part, values, slopes, m in zip(
+            problem.parts, found.values, found.slopes, made, strict=True
+        )
+    ]
     parameters = parameter_table(problem, tasks, covariance, known)
     derived = merged(problem, tables, found.slopes)
     c = problem.coordinates
     products = tuple(known_products(c.names, c.positive, c.sd, known))
-    other, moved = rivals(problem, stages[0] if problem.method == "linear" else stages[-1], parameters | derived)
+    other, moved = rivals(
+        problem, stages[0] if problem.method == "linear" else stages[-1], parameters | derived
+    )
     share = elsewhere(ended)
     if share > UNSETTLED:
         moved |= {n for n in parameters | derived if base_of(n).startswith("harmonic_")}
         other += (may_be_elsewhere(share),)
     moved |= too_curved(problem, derived, known)
-    parameters, derived = (widened(without_errors(moved, table), ended.widening) for table in (parameters, derived))
-    ends = ended.intervals([n for n, p in (parameters | derived).items() if p.stderr and (n in derived or n in c.names)])
+    parameters, derived = (
+        widened(without_errors(moved, table), ended.widening) for table in (parameters, derived)
+    )
+    ends = ended.intervals(
+        [
+            n
+            for n, p in (parameters | derived).items()
+            if p.stderr and (n in derived or n in c.names)
+        ]
+    )
     parameters, derived = (with_intervals(table, ends) for table in (parameters, derived))
     polish = polish_check(problem, stages, derived)
     parts, notices = _parts(plan, stages, tasks, ended, made, polish)
     describes = judgement is None or judgement.adequate
-    line_test = None if interrupted or not plan.check_seeds else harmonic_test(problem, final, judged=describes)
+    line_test = (
+        None
+        if interrupted or not plan.check_seeds
+        else harmonic_test(problem, final, judged=describes)
+    )
     simulated = bool(plan.check_seeds) or preliminary or not problem.control
-    beyond = () if simulated else tuple(n for task in tasks for n in second_order(settled(task)).notices)
+    beyond = (
+        () if simulated else tuple(n for task in tasks for n in second_order(settled(task)).notices)
+    )
     return FitResult(
         success=success,
         message=message,
@@ -182,7 +231,8 @@ def _six_digits(values: np.ndarray) -> tuple[float, ...]:
 
 
 class _Made(NamedTuple):
-    """Moments of every fresh seed on a target's bins, the expected powers if they are simulated, a stretch of output."""
+    """Moments of every fresh seed on a target's bins, the expected powers if they are simulated, a
+    stretch of output."""
 
     each: Moments
     expected: np.ndarray | None
@@ -198,19 +248,27 @@ def _simulated(problem: FitProblem, part: Part, task: AbstractTask, seeds: int) 
     each = each._replace(power=np.asarray(each.power)[:, part.chosen])
     start = round((runs.time[-1] - STRETCH) * runs.rate)
     # A path of weak numbers is none to look at.
-    output = runs.output[0] if problem.draws.increments == "gaussian" else simulate(still, key).output
+    output = (
+        runs.output[0] if problem.draws.increments == "gaussian" else simulate(still, key).output
+    )
     stretch = runs.time[start:], np.asarray(output)[start:]
-    return _Made(each, None if expected is None else np.asarray(expected.power)[part.chosen], stretch)
+    return _Made(
+        each, None if expected is None else np.asarray(expected.power)[part.chosen], stretch
+    )
 
 
 def _expected_only(moments: Moments) -> _Made:
     """Of the linear response, where nothing is simulated."""
-    return _Made(jax.tree.map(lambda x: np.asarray(x)[None], moments), None, (np.zeros(0), np.zeros(0)))
+    return _Made(
+        jax.tree.map(lambda x: np.asarray(x)[None], moments), None, (np.zeros(0), np.zeros(0))
+    )
 
 
 def _observed(part: Part, each: Moments) -> dict[str, Any]:
     """What follows from the mean of the moments, where there is a spectrum."""
-    return observed(jax.tree.map(lambda x: np.mean(x, axis=0), each)) if len(part.target.bins) else {}
+    return (
+        observed(jax.tree.map(lambda x: np.mean(x, axis=0), each)) if len(part.target.bins) else {}
+    )
 
 
 def _parts(
@@ -233,17 +291,38 @@ def _parts(
         check: dict[str, float | int] = {}
         if simulated.expected is not None:
             check = linear_check(np.asarray(simulated.each.power), simulated.expected, statistics)
-        elif polished and len(residual) and isinstance(model := stages[-1].objective.parts[i].model, Linear):
-            check = {"largest_deviation": float(np.max(np.abs(np.asarray(model.correction.power) - 1)))}
+        elif (
+            polished
+            and len(residual)
+            and isinstance(model := stages[-1].objective.parts[i].model, Linear)
+        ):
+            check = {
+                "largest_deviation": float(np.max(np.abs(np.asarray(model.correction.power) - 1)))
+            }
         further = ended.further[i]
-        own = [*notices_of(target, statistics, check | polish, unsettled(plan.problem, moments), plan.problem.method),
-               *further_notices(further), *negative_coefficients(task)]  # fmt: skip
+        own = [
+            *notices_of(
+                target,
+                statistics,
+                check | polish,
+                unsettled(plan.problem, moments),
+                plan.problem.method,
+            ),
+            *further_notices(further),
+            *negative_coefficients(task),
+        ]
         notices += own if len(tasks) == 1 else [f"{part.name}: {notice}" for notice in own]
         parts[part.name or target.name] = FittedPart(
             target=target,
             task=task,
-            chi2_per_bin=float(np.sum(residual**2) / (len(residual) - 1)) if statistics.known and len(residual) else None,
-            rms_log_error=float(np.std(np.log(target.proportional_power / fitted))) if len(residual) else None,
+            chi2_per_bin=(
+                float(np.sum(residual**2) / (len(residual) - 1))
+                if statistics.known and len(residual)
+                else None
+            ),
+            rms_log_error=(
+                float(np.std(np.log(target.proportional_power / fitted))) if len(residual) else None
+            ),
             fitted=fitted,
             harmonic_share=share,
             residual=residual,
@@ -252,13 +331,16 @@ def _parts(
             stretch=simulated.stretch,
             check=check | polish,
             further=further,
-            stiffness=None if part.points is None else np.array([1, 1j]) @ np.asarray(moments.stiffness),
+            stiffness=(
+                None if part.points is None else np.array([1, 1j]) @ np.asarray(moments.stiffness)
+            ),
         )
     return parts, notices
 
 
 def _components(part: Part, task: AbstractTask) -> dict[str, np.ndarray]:
-    """Share of each bin's power that every part of the model has in linear response, of a settled task."""
+    """Share of each bin's power that every part of the model has in linear response, of a settled
+    task."""
     settings, samples = part.target.settings, trial_samples(part.target)
 
     def powers(task: AbstractTask) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -270,24 +352,50 @@ def _components(part: Part, task: AbstractTask) -> dict[str, np.ndarray]:
     active, own = powers(with_active_noise(task))
     relaxation = active - np.sum(own, axis=0)
     floor = power - relaxation - np.sum(rhythms, axis=0)
-    names = ("relaxation", "floor", "harmonic", "tremor", *(f"resonance_{i}" for i in range(2, len(rhythms))))
-    return {name: own / power for name, own in zip(names, (relaxation, floor, *rhythms), strict=False)}
+    names = (
+        "relaxation",
+        "floor",
+        "harmonic",
+        "tremor",
+        *(f"resonance_{i}" for i in range(2, len(rhythms))),
+    )
+    return {
+        name: own / power for name, own in zip(names, (relaxation, floor, *rhythms), strict=False)
+    }
 
 
 def of_several(parts: dict[str, FittedPart]) -> tuple[str, ...]:
     """Spectra of one recording; tasks that do not differ although their targets' levels do."""
     aims = [(name, p.target) for name, p in parts.items()]
-    twice = tuple(f"{a} and {b} state one source and different spectra: if that is one recording, its data count twice and "
-                  "the errors are too small; fit one of them"
-                  for (a, one), (b, two) in itertools.combinations(aims, 2)
-                  if one.source == two.source and one.settings != two.settings)  # fmt: skip
-    levels = {name: p.target.mvc_fraction for name, p in parts.items() if p.target.mvc_fraction is not None}
-    inputs = {tuple(float(parts[name].task[n]) for n in ("P_w", "F_ext") if n in parts[name].task.parameter_names)
-              for name in levels}  # fmt: skip
+    twice = tuple(
+        f"{a} and {b} state one source and different spectra: if that is one recording, its data"
+        " count twice and the errors are too small; fit one of them"
+        for (a, one), (b, two) in itertools.combinations(aims, 2)
+        if one.source == two.source and one.settings != two.settings
+    )
+    levels = {
+        name: p.target.mvc_fraction
+        for name, p in parts.items()
+        if p.target.mvc_fraction is not None
+    }
+    inputs = {
+        tuple(
+            float(parts[name].task[n])
+            for n in ("P_w", "F_ext")
+            if n in parts[name].task.parameter_names
+        )
+        for name in levels
+    }
     if len(set(levels.values())) < 2 or len(inputs) > 1:
         return twice
     said = ", ".join(f"{name} {100 * level:.3g} % MVC" for name, level in levels.items())
-    return (*twice, f"the targets state different levels ({said}), but their tasks have the same forces: give tasks=")
+    return (
+        *twice,
+        (
+            f"the targets state different levels ({said}), but their tasks have the same forces:"
+            " give tasks="
+        ),
+    )
 
 
 def unsimulated(plan: Plan, stages: list[Stage]) -> tuple[str, ...]:
@@ -295,37 +403,64 @@ def unsimulated(plan: Plan, stages: list[Stage]) -> tuple[str, ...]:
     if plan.check_seeds or not any(len(part.target.bins) for part in plan.problem.parts):
         return ()
     if len(plan.problem.parts) == 1:
-        return (UNCHECKED if stages[-1].name == "polishing" or not plan.problem.control else TOGETHER,)
+        return (
+            UNCHECKED if stages[-1].name == "polishing" or not plan.problem.control else TOGETHER,
+        )
     if stages[-1].name == "polishing":
         return ()
-    return ("fitted by the formula alone. The correction by simulation was left out; usually it is 0.2 % of a bin",)
+    return (
+        (
+            "fitted by the formula alone. The correction by simulation was left out; usually it is"
+            " 0.2 % of a bin"
+        ),
+    )
 
 
 def _not_finite(problem: FitProblem) -> str:
     if problem.method != "linear":
-        return ("none of the starts gives a finite spectrum: probably the simulation grows without limit. Lower the noise, "
-                "or in Python dt")  # fmt: skip
+        return (
+            "none of the starts gives a finite spectrum: probably the simulation grows without"
+            " limit. Lower the noise, or in Python dt"
+        )
     if len(problem.parts) == 1:
-        return ("none of the starts gives a spectrum: the muscle has no stable equilibrium, or no noise moves "
-                f"{problem.parts[0].task.output_name} (noise on damping alone does nothing when nothing moves). Check the "
-                "values that you fixed or gave")  # fmt: skip
-    return ("none of the starts gives a spectrum of every target: a task has no stable equilibrium, or no noise moves its "
-            "output. Fit the targets one by one to see which")  # fmt: skip
+        return (
+            "none of the starts gives a spectrum: the muscle has no stable equilibrium, or no"
+            f" noise moves {problem.parts[0].task.output_name} (noise on damping alone does nothing"
+            " when nothing moves). Check the values that you fixed or gave"
+        )
+    return (
+        "none of the starts gives a spectrum of every target: a task has no stable equilibrium, or"
+        " no noise moves its output. Fit the targets one by one to see which"
+    )
 
 
 def _failed(problem: FitProblem, common: dict[str, Any], reason: str) -> FitResult:
     free = len(problem.coordinates.names)
     parts, notices = {}, []
     for part in problem.parts:
-        notices += [n if len(problem.parts) == 1 else f"{part.name}: {n}" for n in part.target.notices]
+        notices += [
+            n if len(problem.parts) == 1 else f"{part.name}: {n}" for n in part.target.notices
+        ]
         nothing, none = np.full(len(part.target.bins), np.nan), (np.zeros(0), np.zeros(0))
-        made = FittedPart(part.target, part.task, None, None, nothing, nothing, nothing, None, {}, none, {}, {})
+        made = FittedPart(
+            part.target, part.task, None, None, nothing, nothing, nothing, None, {}, none, {}, {}
+        )
         parts[part.name or part.target.name] = made
     unknown = Identifiability.of_covariance(np.eye(free))
     tasks = tuple(part.task for part in problem.parts)
     return FitResult(
-        success=False, message=reason, adequacy=None, parts=parts, derived={}, products=(), correlation={}, undetermined=(),
-        parameters=parameter_table(problem, tasks, np.zeros((free, free)), unknown), profile=None, harmonic_p_value=None,
-        singular_values=np.full(free, np.nan), notices=tuple(notices),
+        success=False,
+        message=reason,
+        adequacy=None,
+        parts=parts,
+        derived={},
+        products=(),
+        correlation={},
+        undetermined=(),
+        parameters=parameter_table(problem, tasks, np.zeros((free, free)), unknown),
+        profile=None,
+        harmonic_p_value=None,
+        singular_values=np.full(free, np.nan),
+        notices=tuple(notices),
         **common,
-    )  # fmt: skip
+    )

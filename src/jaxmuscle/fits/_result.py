@@ -1,4 +1,5 @@
-"""The result of a fit, of one target or of several: what was found, how sure it is, and what it cannot say."""
+"""The result of a fit, of one target or of several: what was found, how sure it is, and what it
+cannot say."""
 
 import os
 from collections.abc import Mapping
@@ -28,7 +29,16 @@ from ._adequacy import Adequacy
 from ._fit_file import FORMAT, FORMATS, FitTable, PartTable, disagreement
 from ._ladder import Rung
 from ._methods import methods_of_fit
-from ._part import Estimate, FittedPart, Start, estimates_to_table, met, part_to_table, read_estimates, read_part
+from ._part import (
+    Estimate,
+    FittedPart,
+    Start,
+    estimates_to_table,
+    met,
+    part_to_table,
+    read_estimates,
+    read_part,
+)
 from ._result_text import WHAT_TO_DO, card_of, in_use, once, per_newton
 
 if TYPE_CHECKING:
@@ -43,19 +53,23 @@ PROFILE = ("frequency_hz", "chi2_rise")
 class FitResult(Result, eqx.Module):
     """What a fit found, of one target or of several.
 
-    `success` and `message`, whether the search converged; `adequacy`, whether the model describes the data (an `Adequacy`,
-    None where the scatter of the data is unknown or there is no fit); `parts`, a `FittedPart` for each target by name;
-    `method`; `parameters` and `derived` (`Estimate`s; with several targets, what belongs to one is called "name@target",
-    what is the same number for all by its own name), their errors multiplied by `adequacy.widening`, √(chi² / expected),
-    where the model does not describe the data (but not that of a measured mean or coefficient of variation which the fit
-    meets); `products` and ratios of parameters that the data determine; `correlation` of the free parameters;
-    `undetermined`, sentences naming what can be scaled together without the data noticing; `ladder`, the models that were
-    tried (`Rung`s; empty where one was asked for, in a cohort the one that all got); `singular_values` of the Jacobian
-    (residuals in standard deviations, parameters in the prior's); the table of `starts`; `profile`, harmonic frequencies
-    [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`, how often spectra without harmonic would show
-    one as strong (both None with several targets); `notices`; `seed`; `settings`; `versions`. An `Adequacy`, a `Rung` and a
-    `Start` have as attributes what docs/reference/files.md lists for `adequacy`, `ladder` and `starts`. A fit of one target
-    has what its part has as its own: `task`, `target`, `chi2_per_bin`, `fitted` and so on.
+    `success` and `message`, whether the search converged; `adequacy`, whether the model describes
+    the data (an `Adequacy`, None where the scatter of the data is unknown or there is no fit);
+    `parts`, a `FittedPart` for each target by name; `method`; `parameters` and `derived`
+    (`Estimate`s; with several targets, what belongs to one is called "name@target", what is the
+    same number for all by its own name), their errors multiplied by `adequacy.widening`, √(chi² /
+    expected), where the model does not describe the data (but not that of a measured mean or
+    coefficient of variation which the fit meets); `products` and ratios of parameters that the data
+    determine; `correlation` of the free parameters; `undetermined`, sentences naming what can be
+    scaled together without the data noticing; `ladder`, the models that were tried (`Rung`s; empty
+    where one was asked for, in a cohort the one that all got); `singular_values` of the Jacobian
+    (residuals in standard deviations, parameters in the prior's); the table of `starts`; `profile`,
+    harmonic frequencies [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`,
+    how often spectra without harmonic would show one as strong (both None with several targets);
+    `notices`; `seed`; `settings`; `versions`. An `Adequacy`, a `Rung` and a `Start` have as
+    attributes what docs/reference/files.md lists for `adequacy`, `ladder` and `starts`. A fit of
+    one target has what its part has as its own: `task`, `target`, `chi2_per_bin`, `fitted` and so
+    on.
     """
 
     success: bool
@@ -79,31 +93,41 @@ class FitResult(Result, eqx.Module):
     versions: dict[str, str]
 
     def __getitem__(self, name: str) -> Estimate:
-        """The parameter or derived quantity of that name, with its `value`, `stderr`, `interval` and `unit`.
+        """The parameter or derived quantity of that name, with its `value`, `stderr`, `interval`
+        and `unit`.
 
-        Where no mean force in newtons was given, these are newtons of the model muscle, and print shows forces, masses,
-        stiffness and damping divided by its mean force, `result["mean"].value`, as the person's are unknown. `per_newton`
-        and `as_shown(result.found)` give what is shown.
+        Where no mean force in newtons was given, these are newtons of the model muscle, and print
+        shows forces, masses, stiffness and damping divided by its mean force,
+        `result["mean"].value`, as the person's are unknown. `per_newton` and
+        `as_shown(result.found)` give what is shown.
 
         Raises `ValueError` for an unknown name.
         """
         known = self.parameters | self.derived
         if name not in known:
-            raise ValueError(f"unknown quantity {name!r} of the fit of {self.title}: {choices(name, known)}")
+            raise ValueError(
+                f"unknown quantity {name!r} of the fit of {self.title}: {choices(name, known)}"
+            )
         return known[name]
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row for each parameter and derived quantity, in the units of `result[name]`.
 
-        What is both has one row. It counts as a parameter, and has the name that people use, as `tremor_frequency`.
+        What is both has one row. It counts as a parameter, and has the name that people use, as
+        `tremor_frequency`.
 
-        Columns: `quantity`; `kind`, "parameter" or "derived"; `value`; `stderr`, NaN where the data do not determine it;
-        `low` and `high`, ends of the 95 % interval, NaN where one is open or was not computed; `unit`; `free`, whether it
-        was fitted; `determined`, whether it has a standard error.
+        Columns: `quantity`; `kind`, "parameter" or "derived"; `value`; `stderr`, NaN where the data
+        do not determine it; `low` and `high`, ends of the 95 % interval, NaN where one is open or
+        was not computed; `unit`; `free`, whether it was fitted; `determined`, whether it has a
+        standard error.
         """
         own = self.parameters.keys() | {in_use(name) for name in self.parameters}
-        return frame([{"quantity": name, "kind": "parameter" if name in own else "derived", **p.row()}
-                      for name, p in once(self.parameters, self.derived).items()])  # fmt: skip
+        return frame(
+            [
+                {"quantity": name, "kind": "parameter" if name in own else "derived", **p.row()}
+                for name, p in once(self.parameters, self.derived).items()
+            ]
+        )
 
     @property
     def only(self) -> FittedPart:
@@ -114,7 +138,8 @@ class FitResult(Result, eqx.Module):
     target = of_only("target", "The target.")
     chi2_per_bin = of_only(
         "chi2_per_bin",
-        "`Σ residual² / (bins - 1)` about `fitted`, None without knowledge of the spread. The verdict has `adequacy.chi2`.",
+        "`Σ residual² / (bins - 1)` about `fitted`, None without knowledge of the spread. The"
+        " verdict has `adequacy.chi2`.",
     )
     rms_log_error = of_only("rms_log_error", "Standard deviation of the log of target over fit.")
     fitted = of_only("fitted", "Fitted proportional power on the target's bins.")
@@ -127,7 +152,8 @@ class FitResult(Result, eqx.Module):
 
     @property
     def adequate(self) -> bool | None:
-        """Whether the model describes the data, `adequacy_p >= 0.01`; None where that cannot be judged."""
+        """Whether the model describes the data, `adequacy_p >= 0.01`; None where that cannot be
+        judged."""
         return None if self.adequacy is None else self.adequacy.adequate
 
     @property
@@ -142,7 +168,8 @@ class FitResult(Result, eqx.Module):
 
     @property
     def closeness(self) -> str:
-        """Chi² of the verdict, `adequacy.chi2`, divided by `data`, as "chi2 per bin 0.73"; empty if it cannot be judged."""
+        """Chi² of the verdict, `adequacy.chi2`, divided by `data`, as "chi2 per bin 0.73"; empty if
+        it cannot be judged."""
         if self.adequacy is None:
             return ""
         each = "bin" if all(part.stiffness is None for part in self.parts.values()) else "datum"
@@ -154,8 +181,14 @@ class FitResult(Result, eqx.Module):
         if not self.success:
             return f"not fitted: {self.message}"
         if self.adequacy is None:
-            return "cannot be judged: the target does not say how much its powers scatter (give segments or sigma)"
-        found = f"{self.closeness} (expected {self.adequacy.expected / self.data:.2f}), {probability(self.adequacy.p)}"
+            return (
+                "cannot be judged: the target does not say how much its powers scatter (give"
+                " segments or sigma)"
+            )
+        found = (
+            f"{self.closeness} (expected {self.adequacy.expected / self.data:.2f}),"
+            f" {probability(self.adequacy.p)}"
+        )
         if self.adequacy.adequate:
             return f"describes the data: {found}"
         return f"does not describe the data: {found}; {self.adequacy.misfit}"
@@ -165,18 +198,26 @@ class FitResult(Result, eqx.Module):
         """What the verdict means for the numbers, and what to do."""
         if self.adequacy is None or self.adequacy.adequate:
             return ()
-        told = [f"standard errors are widened by a factor of {self.adequacy.widening:.2g}: the model misses the data"]
-        measured = {name.replace("_", " ") for part in self.parts.values() for name in met(part.further)}
+        told = [
+            f"standard errors are widened by a factor of {self.adequacy.widening:.2g}: the model"
+            " misses the data"
+        ]
+        measured = {
+            name.replace("_", " ") for part in self.parts.values() for name in met(part.further)
+        }
         if measured:
             told[0] += f". Not widened, since measured directly: {', '.join(sorted(measured))}"
         if "harmonic_frequency" in self.free:
-            told.append("no p-value of the harmonic: where the model misses the data, any harmonic improves the fit")
+            told.append(
+                "no p-value of the harmonic: where the model misses the data, any harmonic improves"
+                " the fit"
+            )
         return (*told, WHAT_TO_DO)
 
     @property
     def per_newton(self) -> dict[str, float]:
-        """Stiffness [1/m] and damping [s/m] of both tissues at rest (`K_w0`, `K_z0`, `C_w0`, `C_z0`) per newton of mean
-        force: free of the scale of force.
+        """Stiffness [1/m] and damping [s/m] of both tissues at rest (`K_w0`, `K_z0`, `C_w0`,
+        `C_z0`) per newton of mean force: free of the scale of force.
 
         Empty where a mean force or a dynamic stiffness was given, and where the output is no force.
         """
@@ -184,7 +225,11 @@ class FitResult(Result, eqx.Module):
         if known or self.only.stiffness is not None or self.task.output_unit != "N":
             return {}
         mean = self.derived["mean"].value if "mean" in self.derived else np.nan
-        return {n: self.derived[n].value / mean for n in ("K_w0", "K_z0", "C_w0", "C_z0") if n in self.derived}
+        return {
+            n: self.derived[n].value / mean
+            for n in ("K_w0", "K_z0", "C_w0", "C_z0")
+            if n in self.derived
+        }
 
     @property
     def tasks(self) -> dict[str, AbstractTask]:
@@ -209,30 +254,44 @@ class FitResult(Result, eqx.Module):
     @property
     def derived_names(self) -> tuple[str, ...]:
         """Names that derived quantities have in this fit."""
-        return derived_names(self.task, self.only.fitted.size > 0) if len(self.parts) == 1 else tuple(self.derived)
+        return (
+            derived_names(self.task, self.only.fitted.size > 0)
+            if len(self.parts) == 1
+            else tuple(self.derived)
+        )
 
     @property
     def determined(self) -> dict[str, Estimate]:
-        """Fitted parameters and derived quantities that have a standard error; what is both, once."""
+        """Fitted parameters and derived quantities that have a standard error; what is both,
+        once."""
         return {name: p for name, p in self.found.items() if p.stderr is not None}
 
     @property
     def found(self) -> dict[str, Estimate]:
-        """Fitted parameters and derived quantities; what is both, once, by the name that people use."""
+        """Fitted parameters and derived quantities; what is both, once, by the name that people
+        use."""
         return once({name: p for name, p in self.parameters.items() if p.free}, self.derived)
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What was checked, in sentences: linear response against simulation, and whether there is a harmonic."""
+        """What was checked, in sentences: linear response against simulation, and whether there is
+        a harmonic."""
         single = len(self.parts) == 1
-        said = [s if single else f"{name}: {s}" for name, part in self.parts.items() for s in part.remarks]
+        said = [
+            s if single else f"{name}: {s}"
+            for name, part in self.parts.items()
+            for s in part.remarks
+        ]
         if (p := self.harmonic_p_value) is not None:
-            said.append(f"the harmonic is {'not ' * (p >= 0.05)}significant: p = {p:.2g}, the share of simulated spectra "
-                        "without a harmonic that show one as strong by chance")  # fmt: skip
+            said.append(
+                f"the harmonic is {'not ' * (p >= 0.05)}significant: p = {p:.2g}, the share of"
+                " simulated spectra without a harmonic that show one as strong by chance"
+            )
         return tuple(said)
 
     def methods(self) -> str | None:
-        """A paragraph for the methods section of a paper; None for several targets, a moved insertion, a failed fit."""
+        """A paragraph for the methods section of a paper; None for several targets, a moved
+        insertion, a failed fit."""
         return methods_of_fit(self)
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
@@ -240,11 +299,13 @@ class FitResult(Result, eqx.Module):
         return plot.fit(self, ax)
 
     def save(self, path: str | Path) -> None:
-        """Write JSON atomically; `load_result` reads it back equal. That of one target serves wherever a preset does."""
+        """Write JSON atomically; `load_result` reads it back equal. That of one target serves
+        wherever a preset does."""
         write_json(path, to_table(self))
 
     def as_shown(self, table: Mapping[str, Estimate]) -> dict[str, Estimate]:
-        """A table of quantities as it is shown: per newton of mean force where the scale of force is unknown."""
+        """A table of quantities as it is shown: per newton of mean force where the scale of force
+        is unknown."""
         return per_newton(table, self.derived["mean"].value) if self.per_newton else dict(table)
 
     def _card(self) -> Card:
@@ -275,7 +336,9 @@ def to_table(result: FitResult) -> dict[str, Any]:
         "ladder": [rung._asdict() for rung in result.ladder],
         "singular_values": with_nulls(result.singular_values),
         "starts": [vars(s) | {"values": list(s.values)} for s in result.starts],
-        "profile": None if profile is None else dict(zip(PROFILE, map(with_nulls, profile), strict=True)),
+        "profile": (
+            None if profile is None else dict(zip(PROFILE, map(with_nulls, profile), strict=True))
+        ),
         "harmonic_p_value": result.harmonic_p_value,
         "notices": list(result.notices),
         "seed": result.seed,
@@ -285,25 +348,34 @@ def to_table(result: FitResult) -> dict[str, Any]:
 
 
 def load_result(path: str | Path) -> FitResult:
-    """Read the `fit.json` at `path`, of one target or several. Raises `ResultError` naming the file and what is wrong.
+    """Read the `fit.json` at `path`, of one target or several. Raises `ResultError` naming the file
+    and what is wrong.
 
         result.save("fit.json")
         result = jm.load_result("fit.json")
 
-    A key is an error if it is unknown, of a wrong type, contradicts another, or is missing against docs/reference/files.md.
+    A key is an error if it is unknown, of a wrong type, contradicts another, or is missing against
+    docs/reference/files.md.
     """
     if not isinstance(path, str | os.PathLike):
         raise ResultError(f"path {path!r}: give the path of a fit.json")
     path = expanded(path)
-    table = parsed(read_text(path, ResultError, instead="a fit.json"), str(path), "JSON", ResultError)
+    table = parsed(
+        read_text(path, ResultError, instead="a fit.json"), str(path), "JSON", ResultError
+    )
     if type(table.get("format")) is not int or table["format"] not in FORMATS:
-        raise ResultError(f"{path}: is not a fit result of format {' or '.join(map(str, FORMATS))}; write it with "
-                          "FitResult.save")  # fmt: skip
+        raise ResultError(
+            f"{path}: is not a fit result of format {' or '.join(map(str, FORMATS))}; write it with"
+            " FitResult.save"
+        )
     try:
         result = _from_table(table, str(path))
-        # What can be made from the rest of the file must be what the file says; words may have changed since.
+        # What can be made from the rest of the file must be what the file says; words may have
+        # changed since.
         stated = {**table, "format": FORMAT, "verdict": result.verdict}
-        wrong = disagreement(result) or contradiction(stated, to_table(result), whole=table["format"] == FORMAT)
+        wrong = disagreement(result) or contradiction(
+            stated, to_table(result), whole=table["format"] == FORMAT
+        )
     except (ValueError, ArithmeticError) as error:
         raise error if isinstance(error, ResultError) else ResultError(f"{path}: {error}") from None
     if wrong:
@@ -314,14 +386,21 @@ def load_result(path: str | Path) -> FitResult:
 def _from_table(table: dict[str, Any], file: str) -> FitResult:
     own = {field.name for field in msgspec.structs.fields(PartTable)}
     several = "parts" in table
-    parts = converted(table["parts"], dict[str, dict[str, Any]], "parts") if several else {
-        "": {key: value for key, value in table.items() if key in own}
-    }  # fmt: skip
-    rest = {key: value for key, value in table.items() if key != "parts" and (several or key not in own)}
+    parts = (
+        converted(table["parts"], dict[str, dict[str, Any]], "parts")
+        if several
+        else {"": {key: value for key, value in table.items() if key in own}}
+    )
+    rest = {
+        key: value for key, value in table.items() if key != "parts" and (several or key not in own)
+    }
     said = checked(rest, FitTable, file, ResultError)
     whole = said.format > 2
     read = {
-        name: read_part(checked(part, PartTable, f"{file}: parts.{name}" if several else file, ResultError), whole=whole)
+        name: read_part(
+            checked(part, PartTable, f"{file}: parts.{name}" if several else file, ResultError),
+            whole=whole,
+        )
         for name, part in parts.items()
     }
     if several and len(read) < 2:
@@ -341,7 +420,11 @@ def _from_table(table: dict[str, Any], file: str) -> FitResult:
         ladder=tuple(Rung(**msgspec.structs.asdict(rung)) for rung in said.ladder),
         singular_values=from_nulls(said.singular_values),
         starts=tuple(Start(s.cost, s.success, s.steps, s.values) for s in said.starts),
-        profile=None if said.profile is None else tuple(from_nulls(getattr(said.profile, name)) for name in PROFILE),
+        profile=(
+            None
+            if said.profile is None
+            else tuple(from_nulls(getattr(said.profile, name)) for name in PROFILE)
+        ),
         harmonic_p_value=said.harmonic_p_value,
         notices=tuple(said.notices),
         seed=said.seed,

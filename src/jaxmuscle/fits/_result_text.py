@@ -21,7 +21,14 @@ from ._part import Estimate, FittedPart
 if TYPE_CHECKING:
     from ._result import FitResult
 
-RELATIVE = {"N": "1", "N/m": "1/m", "N s/m": "s/m", "N/m^3": "1/m^3", "N s^3/m^3": "s^3/m^3", "kg": "kg/N"}
+RELATIVE = {
+    "N": "1",
+    "N/m": "1/m",
+    "N s/m": "s/m",
+    "N/m^3": "1/m^3",
+    "N s^3/m^3": "s^3/m^3",
+    "kg": "kg/N",
+}
 ALIASES = {
     "resonance_frequency": "tremor_frequency",
     "resonance_width": "tremor_width",
@@ -32,17 +39,20 @@ OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
 BROAD = 1.7 * 3.92  # standard errors: an interval that is wider than theirs
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 WHAT_TO_DO = (
-    "what to do: do not interpret the parameters. Report that the model does not describe the data, and report none of its "
-    "numbers. What needs no model (mean, variation, power by band, the peak of a tremor) comes from `jaxmuscle steadiness`. "
-    "To go on, look at the residuals in the figure, and whether the recording drifts. `jaxmuscle compare fit.json` tries "
-    "other noises; it takes as long as all fits so far"
+    "what to do: do not interpret the parameters. Report that the model does not describe the data,"
+    " and report none of its numbers. What needs no model (mean, variation, power by band, the peak"
+    " of a tremor) comes from `jaxmuscle steadiness`. To go on, look at the residuals in the"
+    " figure, and whether the recording drifts. `jaxmuscle compare fit.json` tries other noises; it"
+    " takes as long as all fits so far"
 )
 
 
 def card_of(result: "FitResult") -> Card:
-    """The result as text, and as a table of all its numbers: those that the data determine first, then what was fixed."""
+    """The result as text, and as a table of all its numbers: those that the data determine first,
+    then what was fixed."""
     rows = []
-    silent = all(float(part.task.harmonic.amplitude) == 0 for part in result.parts.values())  # then it has no frequency
+    # then it has no frequency
+    silent = all(float(part.task.harmonic.amplitude) == 0 for part in result.parts.values())
     fixed = {name: p for name, p in result.parameters.items() if not p.free}
     for name, p in result.as_shown(once(fixed, result.found)).items():
         if silent and base_of(name).startswith("harmonic_"):
@@ -53,8 +63,14 @@ def card_of(result: "FitResult") -> Card:
         rows.append((name, p.in_words(), p.interval_in_words(), unit, state, words))
     order = ("determined", "not determined", "fixed")
     rows.sort(key=lambda row: order.index(row[4]))
-    remarks = (f"{_head(result)}: {result.message}", *_gains(result), *result.advice, *result.notices, *result.remarks,
-               *_held(result))  # fmt: skip
+    remarks = (
+        f"{_head(result)}: {result.message}",
+        *_gains(result),
+        *result.advice,
+        *result.notices,
+        *result.remarks,
+        *_held(result),
+    )
     return Card(text_of(result), _heading(result), COLUMNS, tuple(rows), remarks)
 
 
@@ -72,26 +88,48 @@ def text_of(result: "FitResult") -> str:
     lines = [_heading(result), f"  {_head(result)}"]
     lines += [f"  {result.message}"] * result.success
     if not single:
-        lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in result.parts.items()]
-    lines += [f"  {'' if single else f'{name}: '}{words}" for name, p in result.parts.items() for words in _trials(p.target)]
-    lines += [f"  {heading(_datum(result))}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
+        lines += [
+            f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}"
+            for name, p in result.parts.items()
+        ]
+    lines += [
+        f"  {'' if single else f'{name}: '}{words}"
+        for name, p in result.parts.items()
+        for words in _trials(p.target)
+    ]
+    lines += (
+        [f"  {heading(_datum(result))}", *(f"  {rung}" for rung in result.ladder)]
+        if len(result.ladder) > 1
+        else []
+    )
     lines += [f"  {sentence}" for sentence in passed_over(result.ladder)]
     lines += [f"  {sentence}" for sentence in _gains(result)]
     lines += [f"  {sentence}" for sentence in result.advice]
     lines += [f"  note: {notice}" for notice in result.notices]
     if single and result.rms_log_error is not None:
         lines.append(f"  {_closeness(result.only, verdict=result.closeness)}")
-    lines += [f"  {'' if single else f'{name}: '}{words}" for name, p in result.parts.items() for words in _stiffness(p)]
+    lines += [
+        f"  {'' if single else f'{name}: '}{words}"
+        for name, p in result.parts.items()
+        for words in _stiffness(p)
+    ]
     lines += [f"  {sentence}" for sentence in result.remarks]
     every, shown = result.as_shown(result.found), result.as_shown(result.determined)
     intervals = any(p.interval is not None for p in shown.values())
     bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
     rows = {name: p for name, p in shown.items() if name not in bands}
-    title = "determined by the data" if result.adequate is not False else "would be determined if the model held"
+    title = (
+        "determined by the data"
+        if result.adequate is not False
+        else "would be determined if the model held"
+    )
     lines += _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
     lines += [f"  {sentence}" for sentence in (*_counted(rows, every), *_by_band(result, bands))]
     fixed = [name for name in result.products if name not in result.parameters]
-    said = "products and ratios that the data determine, though not each factor alone (jaxmuscle identifiability has values)"
+    said = (
+        "products and ratios that the data determine, though not each factor alone (jaxmuscle"
+        " identifiability has values)"
+    )
     lines += [f"  {said}: {', '.join(map(as_people_say, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
     title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
@@ -100,16 +138,23 @@ def text_of(result: "FitResult") -> str:
     if factor := result.settings.get("carried"):
         moved = any(part.stiffness is not None for part in result.parts.values())
         what = "P_w, stiffness" if moved else "P_w, masses (those that you did not fix), stiffness"
-        lines += [f"  before the fit {what} and damping were multiplied by {factor:.3g}, so that the muscle has the "
-                  "measured mean force" + " (mean_force=False leaves the mean out)" * (not moved)]  # fmt: skip
+        lines += [
+            f"  before the fit {what} and damping were multiplied by {factor:.3g}, so that the"
+            " muscle has the measured mean force"
+            + " (mean_force=False leaves the mean out)"
+            * (not moved)
+        ]
     lines += [f"  {sentence}" for sentence in _held(result)]
     if result.per_newton:
         mean = f"{result.derived['mean'].value:.3g} N"
         torque = any(part.target.quantity == "torque" for part in result.parts.values())
         given = " (of a torque it needs the lever arm: --lever-arm)" * torque
-        lines += [f"  no mean force in newtons was given{given}, so the scale of force is unknown. Forces, masses, "
-                  "stiffness and damping are stated here per newton of mean force. In fit.json (Python: result['K_w0'], "
-                  f"to_dataframe()) they are those of a model muscle that pulls with {mean}: divide by {mean}"]  # fmt: skip
+        lines += [
+            f"  no mean force in newtons was given{given}, so the scale of force is unknown."
+            " Forces, masses, stiffness and damping are stated here per newton of mean force. In"
+            " fit.json (Python: result['K_w0'], to_dataframe()) they are those of a model muscle"
+            f" that pulls with {mean}: divide by {mean}"
+        ]
     if result.undetermined:
         whose = "the data leave" if single else "all targets together leave"
         lines += [f"  {whose} open:", *(f"    - {sentence}" for sentence in result.undetermined)]
@@ -117,7 +162,8 @@ def text_of(result: "FitResult") -> str:
 
 
 def _held(result: "FitResult") -> list[str]:
-    """The masses and lengths that a fit takes as given, where its stiffness in newtons depends on them."""
+    """The masses and lengths that a fit takes as given, where its stiffness in newtons depends on
+    them."""
     whose = next((name for name, part in result.parts.items() if part.stiffness is not None), None)
     if not result.derived or (len(result.parts) > 1 and whose is None):
         return []
@@ -128,31 +174,56 @@ def _held(result: "FitResult") -> list[str]:
     names = ("m_w", *(("m_z",) if not moved else ()), *LENGTHS)
     if not set(names) <= set(task.parameter_names):
         return []
-    free = {name.removesuffix(at) if at else name for name, p in result.parameters.items() if p.free}
+    free = {
+        name.removesuffix(at) if at else name for name, p in result.parameters.items() if p.free
+    }
     held = [name for name in names if name not in free]
-    told = {name: f"{name} = {1e3 * float(task[name]):.3g} mm" if name in LENGTHS else f"{name} = {float(task[name]):.3g} kg"
-            for name in held}  # fmt: skip
+    told = {
+        name: (
+            f"{name} = {1e3 * float(task[name]):.3g} mm"
+            if name in LENGTHS
+            else f"{name} = {float(task[name]):.3g} kg"
+        )
+        for name in held
+    }
     if not moved:
         factor, usual = result.settings.get("carried") or 1.0, float(PARAMETERS["m_w"].default)
-        carried = abs(factor - 1) > 0.005 and all(np.isclose(float(task[m]), factor * usual) for m in ("m_w", "m_z"))
+        carried = abs(factor - 1) > 0.005 and all(
+            np.isclose(float(task[m]), factor * usual) for m in ("m_w", "m_z")
+        )
         means = f"The masses are the usual {usual:g} kg times {factor:.3g}. " * carried
-        means += ("They are no measurements: a held force tells no length and no mass. Half of both x_ref, with twice the "
-                 "stiffness, damping and masses, would fit as well")  # fmt: skip
-        return [f"held fixed: {', '.join(told.values())}. {means}"] if {"m_w", *LENGTHS} <= set(held) else []
+        means += (
+            "They are no measurements: a held force tells no length and no mass. Half of both"
+            " x_ref, with twice the stiffness, damping and masses, would fit as well"
+        )
+        return (
+            [f"held fixed: {', '.join(told.values())}. {means}"]
+            if {"m_w", *LENGTHS} <= set(held)
+            else []
+        )
     said = []
     if "m_w" in held:
-        said += [f"held fixed: {told['m_w']}. The data do not determine it, and the verdict would not notice a wrong "
-                 "value. But a wrong m_w makes C_w0 and K_w0 wrong, too (docs/perturbed.md has by how much). Leave m_w "
-                 "free, as by default: then the errors contain this doubt"]  # fmt: skip
+        said += [
+            f"held fixed: {told['m_w']}. The data do not determine it, and the verdict would not"
+            " notice a wrong value. But a wrong m_w makes C_w0 and K_w0 wrong, too"
+            " (docs/perturbed.md has by how much). Leave m_w free, as by default: then the errors"
+            " contain this doubt"
+        ]
     if "x_ref_w" in held and f"K_w_tangent{at}" in result.derived:
         base = result.derived["K_w0" if "K_w0" in result.derived else f"K_w0{at}"].value
         tangent = result.derived[f"K_w_tangent{at}"].value
-        other = [f"{tangent / (1 + (tangent / base - 1) / times**2):.4g}" for times in OTHER_LENGTHS]
-        lengths = " or ".join(f"{1e3 * times * float(task['x_ref_w']):.3g}" for times in OTHER_LENGTHS)
-        said += [f"held fixed: {told['x_ref_w']}. No record determines it, and K_w0 depends on it: with {lengths} mm K_w0 "
-                 f"would be {' or '.join(other)} N/m, and the fit as good. So report K_w_tangent (stiffness of the active "
-                 "tissue as displaced in the hold) and tangent_stiffness (that of both tissues) instead: these hardly "
-                 "change"]  # fmt: skip
+        other = [
+            f"{tangent / (1 + (tangent / base - 1) / times**2):.4g}" for times in OTHER_LENGTHS
+        ]
+        lengths = " or ".join(
+            f"{1e3 * times * float(task['x_ref_w']):.3g}" for times in OTHER_LENGTHS
+        )
+        said += [
+            f"held fixed: {told['x_ref_w']}. No record determines it, and K_w0 depends on it: with"
+            f" {lengths} mm K_w0 would be {' or '.join(other)} N/m, and the fit as good. So report"
+            " K_w_tangent (stiffness of the active tissue as displaced in the hold) and"
+            " tangent_stiffness (that of both tissues) instead: these hardly change"
+        ]
     return said
 
 
@@ -163,8 +234,13 @@ def _per_newton(result: "FitResult", shown: Mapping[str, Estimate]) -> str:
 
 
 def per_newton(table: Mapping[str, Estimate], mean: float) -> dict[str, Estimate]:
-    """The table with whatever has newtons (or masses, which go with them) over the mean force; without that itself."""
-    return {n: _over(p, mean) if p.unit in RELATIVE else p for n, p in table.items() if base_of(n) != "mean"}
+    """The table with whatever has newtons (or masses, which go with them) over the mean force;
+    without that itself."""
+    return {
+        n: _over(p, mean) if p.unit in RELATIVE else p
+        for n, p in table.items()
+        if base_of(n) != "mean"
+    }
 
 
 def _over(p: Estimate, mean: float) -> Estimate:
@@ -172,19 +248,30 @@ def _over(p: Estimate, mean: float) -> Estimate:
         return None if value is None else value / mean
 
     interval = None if p.interval is None else (over(p.interval[0]), over(p.interval[1]))
-    return Estimate(p.value / mean, RELATIVE[p.unit], over(p.stderr), p.free, p.identifiable, interval)
+    return Estimate(
+        p.value / mean, RELATIVE[p.unit], over(p.stderr), p.free, p.identifiable, interval
+    )
 
 
 def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str]:
     """Rows of name, value ± error, interval and unit."""
     indent, wide = 4, max([26, *(2 + len(name) for name in table)])
-    value, beside = (1 + max([0, *map(len, each)]) for each in
-                     ([p.in_words() for p in table.values()], [p.interval_in_words() for p in table.values()]))  # fmt: skip
+    value, beside = (
+        1 + max([0, *map(len, each)])
+        for each in (
+            [p.in_words() for p in table.values()],
+            [p.interval_in_words() for p in table.values()],
+        )
+    )
     if wide > 26:  # names of one of several targets: no wider than it must be
         indent, wide = 2, wide - 1
     else:
         value, beside = max(20, value), max(20, beside)
-    lines = [f"  {title}:"] if not column else [f"  {title + ': ':<{wide + value + indent}}{column.strip()}"]
+    lines = (
+        [f"  {title}:"]
+        if not column
+        else [f"  {title + ': ':<{wide + value + indent}}{column.strip()}"]
+    )
     for name, p in table.items():
         interval, unit = f"{p.interval_in_words():<{beside}}" if column else "", _beside(name, p)
         lines.append(f"{'':{indent}}{name:<{wide}}{p.in_words():<{value}}{interval}{unit}".rstrip())
@@ -196,32 +283,46 @@ def _beside(name: str, p: Estimate) -> str:
     base, at, _ = name.partition("@")
     if base == "coefficient_of_variation":
         return f"{'' if at else '= '}{100 * p.value:.3g} %"
-    # A parameter of an own muscle has a unit that only its author knows: it is never divided by a force.
+    # A parameter of an own muscle has a unit that only its author knows: it is never divided by a
+    # force.
     return {"1": "", "": "in its own unit"}.get(p.unit, p.unit)
 
 
 def _counted(shown: Mapping[str, Estimate], every: Mapping[str, Estimate]) -> list[str]:
-    """Which intervals are wider than their errors say, and what numbers count where the model has a tremor, in sentences."""
+    """Which intervals are wider than their errors say, and what numbers count where the model has a
+    tremor, in sentences."""
     sentences = []
     broad = [name for name, p in shown.items() if _is_broad(p)]
     if broad:
-        sentences.append(f"{', '.join(broad)}: the interval is much wider than two standard errors to both sides. State the "
-                         "interval: the error holds only near the best value")  # fmt: skip
+        sentences.append(
+            f"{', '.join(broad)}: the interval is much wider than two standard errors to both"
+            " sides. State the interval: the error holds only near the best value"
+        )
     for name in shown:
         base, at, target = name.partition("@")
         rhythm = every.get(f"tremor_frequency{at}{target}")
         if base == "tremor_share" and rhythm is not None:
-            sentences.append(f"{name}: counted from {0.5 * rhythm.value:.2g} Hz on, half of the tremor's frequency")
+            sentences.append(
+                f"{name}: counted from {0.5 * rhythm.value:.2g} Hz on, half of the tremor's"
+                " frequency"
+            )
         if base == "high_frequency_floor" and rhythm is not None:
-            sentences.append(f"{name}: is the mean of the highest third of the bins, tremor included. Do not report it "
-                             "beside the tremor")  # fmt: skip
+            sentences.append(
+                f"{name}: is the mean of the highest third of the bins, tremor included. Do not"
+                " report it beside the tremor"
+            )
     return sentences
 
 
 def _is_broad(p: Estimate) -> bool:
     """Whether its interval is much wider than its standard error says."""
     low, high = p.interval or (None, None)
-    return bool(p.stderr) and low is not None and high is not None and high - low > BROAD * (p.stderr or 0.0)
+    return (
+        bool(p.stderr)
+        and low is not None
+        and high is not None
+        and high - low > BROAD * (p.stderr or 0.0)
+    )
 
 
 def _by_band(result: "FitResult", table: dict[str, Estimate]) -> list[str]:
@@ -229,29 +330,47 @@ def _by_band(result: "FitResult", table: dict[str, Estimate]) -> list[str]:
     sentences = []
     for name, part in result.parts.items():
         at, of = ("", "") if len(result.parts) == 1 else (f"@{name}", f" of {name}")
-        shares = in_bands(part.target.frequency, part.target.settings.resolution) @ part.target.proportional_power
-        fitted = [f"{100 * table[band + at].value:.2g} %" if band + at in table else "not determined" for band in BANDS]
-        each = [f"{low:g}-{high:g} Hz {own} ({100 * share:.2g} %)"
-                for (low, high), own, share in zip(BANDS.values(), fitted, shares, strict=True)]  # fmt: skip
+        shares = (
+            in_bands(part.target.frequency, part.target.settings.resolution)
+            @ part.target.proportional_power
+        )
+        fitted = [
+            f"{100 * table[band + at].value:.2g} %" if band + at in table else "not determined"
+            for band in BANDS
+        ]
+        each = [
+            f"{low:g}-{high:g} Hz {own} ({100 * share:.2g} %)"
+            for (low, high), own, share in zip(BANDS.values(), fitted, shares, strict=True)
+        ]
         known = any(band + at in table for band in BANDS)
-        sentences += [f"power by band{of}, fitted (measured): {', '.join(each)}; in percent of the power in the fitted "
-                      "bins"] * known  # fmt: skip
+        sentences += [
+            f"power by band{of}, fitted (measured): {', '.join(each)}; in percent of the power in"
+            " the fitted bins"
+        ] * known
     return sentences
 
 
 def _head(result: "FitResult") -> str:
     if len(result.parts) > 1:
         return f"together: {', '.join(result.parts)}"
-    return f"{result.target.name} ({result.target.provenance}), {result.only.model}, method {result.method}"
+    return (
+        f"{result.target.name} ({result.target.provenance}), {result.only.model}, method"
+        f" {result.method}"
+    )
 
 
 def _closeness(part: FittedPart, before: str = "", *, verdict: str = "") -> str:
-    """χ² per bin and rms error of the fitted line, as far as they are known; no χ² that the verdict tells already."""
+    """χ² per bin and rms error of the fitted line, as far as they are known; no χ² that the verdict
+    tells already."""
     own = "" if part.chi2_per_bin is None else f"chi2 per bin {part.chi2_per_bin:.2f}"
     mean = " (mean of new simulations)" if verdict.startswith("chi2 per bin") else ""
     said = [] if own in ("", verdict) else [own + mean]
     off = part.rms_log_error
-    said += [] if off is None else [f"rms log error {off:.3f} (bins are off by a factor of {np.exp(off):.2f})"]
+    said += (
+        []
+        if off is None
+        else [f"rms log error {off:.3f} (bins are off by a factor of {np.exp(off):.2f})"]
+    )
     return before * bool(said) + ", ".join(said)
 
 
@@ -261,12 +380,14 @@ def _gains(result: "FitResult") -> tuple[str, ...]:
 
 
 def _datum(result: "FitResult") -> str:
-    """For what chi² of a model that was tried is counted: a bin, or also a point of the dynamic stiffness."""
+    """For what chi² of a model that was tried is counted: a bin, or also a point of the dynamic
+    stiffness."""
     return "bin" if all(part.stiffness is None for part in result.parts.values()) else "datum"
 
 
 def _trials(target: Target) -> list[str]:
-    """How many trials and segments were averaged, and how much the trials differ; nothing of a single trial."""
+    """How many trials and segments were averaged, and how much the trials differ; nothing of a
+    single trial."""
     if target.segments is None or len(target.segments) < 2:
         return []
     counted = f"{len(target.segments)} trials, {sum(target.segments)} Welch segments"
@@ -282,9 +403,13 @@ def _stiffness(part: FittedPart) -> list[str]:
         return []
     known = part.target.stiffness.known
     f, seen = known.frequency, int(np.sum(np.abs(part.stiffness) > 2 * known.stderr))
-    faint = f" ({len(f) - seen} of them smaller than two standard errors, so they tell little)" * (seen < len(f))
-    return [f"dynamic stiffness: {len(f)} points from {f[0]:.2g} to {f[-1]:.2g} Hz{faint}, chi2 per point "
-            f"{part.chi2_per_point:.2f}"]  # fmt: skip
+    faint = f" ({len(f) - seen} of them smaller than two standard errors, so they tell little)" * (
+        seen < len(f)
+    )
+    return [
+        f"dynamic stiffness: {len(f)} points from {f[0]:.2g} to {f[-1]:.2g} Hz{faint}, chi2 per"
+        f" point {part.chi2_per_point:.2f}"
+    ]
 
 
 def as_people_say(product: str) -> str:
@@ -293,11 +418,16 @@ def as_people_say(product: str) -> str:
 
 
 def in_use(name: str) -> str | None:
-    """The name that people use for a parameter, of one target or "name@target"; None where that is its own."""
+    """The name that people use for a parameter, of one target or "name@target"; None where that is
+    its own."""
     base, at, target = name.partition("@")
     return ALIASES[base] + at + target if base in ALIASES else None
 
 
-def once(parameters: Mapping[str, Estimate], derived: Mapping[str, Estimate]) -> dict[str, Estimate]:
+def once(
+    parameters: Mapping[str, Estimate], derived: Mapping[str, Estimate]
+) -> dict[str, Estimate]:
     """Parameters and derived quantities; what is both, once, by the name that people use."""
-    return {name: p for name, p in parameters.items() if in_use(name) not in derived} | dict(derived)
+    return {name: p for name, p in parameters.items() if in_use(name) not in derived} | dict(
+        derived
+    )

@@ -1,4 +1,5 @@
-"""The search of a fit: many starts, the best minima polished, whatever was reached when interrupted."""
+"""The search of a fit: many starts, the best minima polished, whatever was reached when
+interrupted."""
 
 import dataclasses
 import functools
@@ -30,17 +31,22 @@ from ._result import FitResult
 
 FIRST_STEPS = 12
 MOST_RIVALS = 3
-MANY = 64  # starts, of which those that are left behind end sooner; of fewer every end is of interest
+# starts, of which those that are left behind end sooner; of fewer every end is of interest
+MANY = 64
 RIVAL_MARGIN = 6.0
 POLISHES = 4
 STILL = 2e-3
 RENEWALS = 2  # of the target of a moved record, where a richer model than the base one was chosen
-TOLD = {"trying starts": "searching from all starting points", "linear response": "refining the best",
-        "polishing": "correcting by simulation"}  # fmt: skip
+TOLD = {
+    "trying starts": "searching from all starting points",
+    "linear response": "refining the best",
+    "polishing": "correcting by simulation",
+}
 
 
 class FitInterrupted(KeyboardInterrupt):
-    """A fit was interrupted; `tasks`, one for each target, are the best that had been reached, `result` is the fit at these.
+    """A fit was interrupted; `tasks`, one for each target, are the best that had been reached,
+    `result` is the fit at these.
 
     `report` makes the result when it is asked for. Programs may have to be compiled for that.
     """
@@ -56,11 +62,13 @@ class FitInterrupted(KeyboardInterrupt):
             return self.report()
 
 
-def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models: Models | None = None) -> FitResult:
+def search(
+    plan: Plan, answer: Callable[[FitResult], None] | None = None, models: Models | None = None
+) -> FitResult:
     """From the starting points to a result; Ctrl-C ends it with what had been reached.
 
-    `answer` gets the result before its checks; Ctrl-C in these keeps it. Of richer `models` one after the other is tried
-    until one describes the data.
+    `answer` gets the result before its checks; Ctrl-C in these keeps it. Of richer `models` one
+    after the other is tried until one describes the data.
     """
     problem = plan.problem
     stages: list[Stage] = []
@@ -83,10 +91,15 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
             ladder = climb(plan, models, _descended, keep)
             for _ in range(RENEWALS):
                 richer = any(rung.chosen and rung.number > 0 for rung in ladder)
-                anew = models.renewed(_reached(plan, stages)) if richer and models.renewed is not None else None
+                anew = (
+                    models.renewed(_reached(plan, stages))
+                    if richer and models.renewed is not None
+                    else None
+                )
                 if anew is None:
                     break
-                better: list[Climbed] = []  # until they have been tried, what was found before stays
+                # until they have been tried, what was found before stays
+                better: list[Climbed] = []
                 tried = climb(*anew, _descended, better.append)
                 if not better:
                     break
@@ -105,7 +118,9 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
         ended = Endpoint.of(problem, stages[-1])
         if answer is not None and plan.check_seeds:
             answer(_checked_later(_unchecked(plan, stages, ladder, ended)))
-        problem.tell("checking with new simulations" if plan.check_seeds else "computing the errors", 0.8)
+        problem.tell(
+            "checking with new simulations" if plan.check_seeds else "computing the errors", 0.8
+        )
         result = report_fit(plan, stages, ladder, ended=ended)
         if answer is not None and not plan.check_seeds:
             answer(result)
@@ -121,7 +136,9 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
 def _checked_later(found: FitResult) -> FitResult:
     """Without what the checks, which come, will say: two answers to one question puzzle."""
     parts = {name: dataclasses.replace(part, check={}) for name, part in found.parts.items()}
-    return dataclasses.replace(found, parts=parts, notices=tuple(n for n in found.notices if n != UNCHECKED))
+    return dataclasses.replace(
+        found, parts=parts, notices=tuple(n for n in found.notices if n != UNCHECKED)
+    )
 
 
 def _stopped(plan: Plan, stages: list[Stage], *reached: Any, **how: Any) -> FitInterrupted:
@@ -150,20 +167,28 @@ def _unchecked(
 
 
 def search_together(
-    plans: list[Plan], tell: Callable[[str, float], None], number: int = 0, *, replicates: bool = False
+    plans: list[Plan],
+    tell: Callable[[str, float], None],
+    number: int = 0,
+    *,
+    replicates: bool = False,
 ) -> list[FitResult]:
-    """Fits of one model to several data on the same bins, all starts of all fits in one minimisation.
+    """Fits of one model to several data on the same bins, all starts of all fits in one
+    minimisation.
 
-    Linear response alone: no nonlinear correction, no check on simulated seeds, no profile over the frequency. The AIC of
-    the model, whose `number` on the ladder this is, stands in every result. Of `replicates` the muscle that their response
-    alone asks for is not sought: what made them fluctuate is what the model says.
+    Linear response alone: no nonlinear correction, no check on simulated seeds, no profile over the
+    frequency. The AIC of the model, whose `number` on the ladder this is, stands in every result.
+    Of `replicates` the muscle that their response alone asks for is not sought: what made them
+    fluctuate is what the model says.
     """
     problems = [plan.problem for plan in plans]
     points = [starting_points(plan.problem, plan.starts, alone=not replicates) for plan in plans]
     objectives = [problem.linear() for problem in problems]
     first = _together(objectives, points, plans[0].max_steps, "trying starts", tell, (0.0, 0.7))
-    best = [stage.minima.s[contenders(p, stage.minima, RIVAL_MARGIN)[:BATCH]]
-            for p, stage in zip(problems, first, strict=True)]  # fmt: skip
+    best = [
+        stage.minima.s[contenders(p, stage.minima, RIVAL_MARGIN)[:BATCH]]
+        for p, stage in zip(problems, first, strict=True)
+    ]
     known = [_known(problem, stage) for problem, stage in zip(problems, first, strict=True)]
     objectives = [problem.linear(shares) for problem, shares in known]
     second = _together(objectives, best, plans[0].max_steps, "linear response", tell, (0.7, 0.8))
@@ -173,8 +198,12 @@ def search_together(
         finite = np.isfinite(stages[-1].minima.cost[stages[-1].minima.best])
         ended = Endpoint.of(plan.problem, stages[-1]) if finite else None
         judged = ended is not None and ended.adequacy is not None and len(plan.problem.parts) == 1
-        rungs = (rung_of(ended, number)._replace(chosen=True),) if ended is not None and judged else ()
-        results.append(report_fit(plan._replace(settings=unused, check_seeds=0), stages, rungs, ended=ended))
+        rungs = (
+            (rung_of(ended, number)._replace(chosen=True),) if ended is not None and judged else ()
+        )
+        results.append(
+            report_fit(plan._replace(settings=unused, check_seeds=0), stages, rungs, ended=ended)
+        )
         tell(f"computing the errors of {plan.problem.title}", 0.8 + 0.2 * len(results) / len(plans))
     return results
 
@@ -189,7 +218,10 @@ def _together(
 ) -> list[Stage]:
     """One stage of every fit; they differ in their data only."""
     counts = [len(p) for p in points]
-    data = jax.tree.map(lambda *x: np.repeat(np.stack(x), counts, axis=0), *(objective.data for objective in objectives))
+    data = jax.tree.map(
+        lambda *x: np.repeat(np.stack(x), counts, axis=0),
+        *(objective.data for objective in objectives),
+    )
 
     def show(minima: Minima) -> None:
         share = min(1.0, minima.steps.max() / max_steps)
@@ -197,11 +229,20 @@ def _together(
 
     found = least_squares(objectives[0], np.concatenate(points), max_steps, data=data, report=show)
     parts = zip(*(np.split(x, np.cumsum(counts)[:-1]) for x in found), strict=True)
-    return [Stage(name, objective, Minima(*part)) for objective, part in zip(objectives, parts, strict=True)]
+    return [
+        Stage(name, objective, Minima(*part))
+        for objective, part in zip(objectives, parts, strict=True)
+    ]
 
 
-def _stage(problem: FitProblem, stages: list[Stage], objective: Residuals, name: str, shares: tuple[float, float],
-           most: int) -> Any:  # fmt: skip
+def _stage(
+    problem: FitProblem,
+    stages: list[Stage],
+    objective: Residuals,
+    name: str,
+    shares: tuple[float, float],
+    most: int,
+) -> Any:
     """A new stage, and what keeps its newest state and tells the progress."""
     number = len(stages)
 
@@ -238,42 +279,53 @@ def _descended(plan: Plan, points: np.ndarray, stages: list[Stage]) -> Known | N
 def _polished(plan: Plan, known: Known, stages: list[Stage]) -> None:
     """The nonlinear correction, until it no longer changes."""
     (problem, shares), found, max_steps = known, stages[-1].minima, plan.max_steps
-    problem = dataclasses.replace(problem, tell=plan.problem.tell)  # no longer that of one of several models
+    # no longer that of one of several models
+    problem = dataclasses.replace(problem, tell=plan.problem.tell)
     corrections: list[Moments] | None = None
     for turn in range(POLISHES if problem.seeds else 0):
         if not np.isfinite(found.cost[found.best]):
             return
         tasks = problem.tasks_at(np.asarray(problem.coordinates.theta(found.s[found.best])))
-        new = [correction_at(problem, part, task) for part, task in zip(problem.parts, tasks, strict=True)]
+        new = [
+            correction_at(problem, part, task)
+            for part, task in zip(problem.parts, tasks, strict=True)
+        ]
         made = [correction for correction in new if correction is not None]
         if len(made) < len(new):
             return
         if corrections is not None:
             changes = [
-                np.max(np.abs(np.log(a.power / b.power)), initial=0.0) for a, b in zip(made, corrections, strict=True)
+                np.max(np.abs(np.log(a.power / b.power)), initial=0.0)
+                for a, b in zip(made, corrections, strict=True)
             ]
             if max(changes) < STILL:
                 return
         corrections, objective = made, problem.linear(shares, made)
-        show = _stage(problem, stages, objective, "polishing", (0.6 + 0.05 * turn, 0.65 + 0.05 * turn), 15)
+        show = _stage(
+            problem, stages, objective, "polishing", (0.6 + 0.05 * turn, 0.65 + 0.05 * turn), 15
+        )
         found = least_squares(objective, found.s, max_steps, report=show)
 
 
 def _with_recombined(plan: Plan, objective: Residuals, found: Minima) -> Minima:
-    """Where several harmonic frequencies are free: the best point with each of them in turn at its candidates, too."""
+    """Where several harmonic frequencies are free: the best point with each of them in turn at its
+    candidates, too."""
     problem = plan.problem
     turns = len(recombined(problem, np.zeros(len(problem.prior)), 1))
     for turn in range(turns):
         if not np.isfinite(found.cost[found.best]):
             break
         theta = np.asarray(problem.coordinates.theta(found.s[found.best]))
-        more = least_squares(objective, recombined(problem, theta, plan.starts)[turn], plan.max_steps)
+        more = least_squares(
+            objective, recombined(problem, theta, plan.starts)[turn], plan.max_steps
+        )
         found = Minima(*map(np.concatenate, zip(found, more, strict=True)))
     return found
 
 
 def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moments | None:
-    """Moments of the nonlinear model over those of the linear response; None if the task cannot be simulated."""
+    """Moments of the nonlinear model over those of the linear response; None if the task cannot be
+    simulated."""
     if not len(part.target.bins):
         return part.ones
     try:
@@ -285,13 +337,15 @@ def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moment
         return None
     mean = jax.tree.map(lambda x: np.asarray(x).mean(axis=0), each)
     power = mean.power[part.chosen] / np.asarray(expected.power)[part.chosen]
-    level = np.ones(()) if task.quantity == "acceleration" else mean.mean / expected.mean  # the mean of one is zero
+    # the mean of one is zero
+    level = np.ones(()) if task.quantity == "acceleration" else mean.mean / expected.mean
     found = part.ones._replace(power=power, mean=level, variance=mean.variance / expected.variance)
     return found if all(np.all(np.isfinite(x) & (np.asarray(x) > 0)) for x in found[:4]) else None
 
 
 def _montecarlo(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:
-    """All starts in linear response, or on few seeds where there is none; then the best few minima on all seeds."""
+    """All starts in linear response, or on few seeds where there is none; then the best few minima
+    on all seeds."""
     problem, max_steps = plan.problem, plan.max_steps
     if problem.control:
         objective = problem.linear()
@@ -306,14 +360,22 @@ def _montecarlo(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:
     best = first.s[contenders(problem, first, RIVAL_MARGIN)[:MOST_RIVALS]]
     problem, shares = _known(problem, stages[0])
     objective = problem.finer(problem.montecarlo(problem.seeds, shares), best)
-    least_squares(objective, best, max_steps, prepare=problem.finer,
-                  report=_stage(problem, stages, objective, "polishing", (0.4, 0.8), 15))  # fmt: skip
+    least_squares(
+        objective,
+        best,
+        max_steps,
+        prepare=problem.finer,
+        report=_stage(problem, stages, objective, "polishing", (0.4, 0.8), 15),
+    )
 
 
 def _known(problem: FitProblem, stage: Stage) -> tuple[FitProblem, list[Float[np.ndarray, " _"]]]:
-    """What the best point says of how the data scatter: the problem with it, and the line's share of each bin."""
+    """What the best point says of how the data scatter: the problem with it, and the line's share
+    of each bin."""
     seen = seen_best(stage.objective, stage.minima)
-    shares = [np.clip(np.nan_to_num(moments.line / moments.power), 0.0, 1.0) for moments in seen.moments]
+    shares = [
+        np.clip(np.nan_to_num(moments.line / moments.power), 0.0, 1.0) for moments in seen.moments
+    ]
     if np.isfinite(stage.minima.cost[stage.minima.best]):
         problem = problem.scattering_as(problem.tasks_at(seen.theta))
     return problem, shares

@@ -1,4 +1,5 @@
-"""A study: trials of people in conditions and groups, one model fitted to all, what differs, one folder of results."""
+"""A study: trials of people in conditions and groups, one model fitted to all, what differs, one
+folder of results."""
 
 import contextlib
 import dataclasses
@@ -44,16 +45,17 @@ if TYPE_CHECKING:
 AUTO = "auto"
 USUAL = {"rung": 2, "noise": None, "quantities": None, "alpha": 0.05, "correction": "holm"}
 FORMAT = 1
-COMPARED = tuple(name for name in DERIVED if name != "high_frequency_floor")  # which is the band from 8 to 12 Hz again
+# which is the band from 8 to 12 Hz again
+COMPARED = tuple(name for name in DERIVED if name != "high_frequency_floor")
 
 
 class StudyResult(Printed, Result, eqx.Module):
     """What a study found.
 
-    `cohort`, the fits, one of each person in each condition; `cells`, one for each of them: `person`, `group`,
-    `condition`, how many `trials`, their sampling `rates` [Hz], and the `target` made of them; `aic`, the summed AIC
-    of every model that was tried (by rung), of which the lowest was taken; the `options` as they were used; the `source` of
-    the table.
+    `cohort`, the fits, one of each person in each condition; `cells`, one for each of them:
+    `person`, `group`, `condition`, how many `trials`, their sampling `rates` [Hz], and the `target`
+    made of them; `aic`, the summed AIC of every model that was tried (by rung), of which the lowest
+    was taken; the `options` as they were used; the `source` of the table.
     """
 
     cohort: CohortResult
@@ -89,7 +91,8 @@ class StudyResult(Printed, Result, eqx.Module):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """What is compared: what was asked for, else the derived quantities but `high_frequency_floor`.
+        """What is compared: what was asked for, else the derived quantities but
+        `high_frequency_floor`.
 
         Of these, the ones that at least one fit determines.
         """
@@ -98,12 +101,16 @@ class StudyResult(Printed, Result, eqx.Module):
         return tuple(name for name in (COMPARED if asked is None else asked) if name in seen)
 
     def table(self) -> list[dict[str, Any]]:
-        """Tidy rows, one for each person, condition and quantity; `stderr` None where the data do not determine it."""
+        """Tidy rows, one for each person, condition and quantity; `stderr` None where the data do
+        not determine it."""
         asked = self.options["quantities"]
         cells = {cell.target.name: cell for cell in self.cells}
         drop = ("target", "group", "mvc_fraction")
         return [
-            {label: getattr(cells[row["target"]], label) for label in ("person", "group", "condition", "trials")}
+            {
+                label: getattr(cells[row["target"]], label)
+                for label in ("person", "group", "condition", "trials")
+            }
             | {name: value for name, value in row.items() if name not in drop}
             for row in self.cohort.table()
             if asked is None or row["quantity"] in asked
@@ -116,9 +123,10 @@ class StudyResult(Printed, Result, eqx.Module):
     def differences(self) -> tuple[Difference, ...]:
         """Every comparison of `quantities` with at least two people on each side.
 
-        Groups in each condition by Welch's t, conditions within people by the paired t, their interaction (the change from
-        one condition to the other in one group against that in the other) by Welch's t. `p_corrected` is for all
-        comparisons of its kind. People whose fits do not determine a quantity are `left_out` of it: a selection.
+        Groups in each condition by Welch's t, conditions within people by the paired t, their
+        interaction (the change from one condition to the other in one group against that in the
+        other) by Welch's t. `p_corrected` is for all comparisons of its kind. People whose fits do
+        not determine a quantity are `left_out` of it: a selection.
         """
         kinds: dict[str, list[Difference]] = {}
         for quantity in self.quantities:
@@ -136,10 +144,18 @@ class StudyResult(Printed, Result, eqx.Module):
     def _within_people(self, quantity: str) -> Iterable[Difference]:
         cells = {(cell.person, cell.condition): cell for cell in self.cells}
         for a, b in itertools.combinations(self.conditions, 2):
-            both = [(group, cells[person, a], cells[person, b]) for person, group in self.people.items()
-                    if (person, a) in cells and (person, b) in cells]  # fmt: skip
-            pairs = [(group, self._number(quantity, x), self._number(quantity, y)) for group, x, y in both]
-            changes = [(group, None if x is None or y is None else change(x, y)) for group, x, y in pairs]
+            both = [
+                (group, cells[person, a], cells[person, b])
+                for person, group in self.people.items()
+                if (person, a) in cells and (person, b) in cells
+            ]
+            pairs = [
+                (group, self._number(quantity, x), self._number(quantity, y))
+                for group, x, y in both
+            ]
+            changes = [
+                (group, None if x is None or y is None else change(x, y)) for group, x, y in pairs
+            ]
             known = [each for _, each in changes if each is not None]
             if len(known) > 1:
                 found = paired(quantity, a, b, known, 1 - self.options["alpha"])
@@ -151,7 +167,9 @@ class StudyResult(Printed, Result, eqx.Module):
     ) -> Iterable[Difference]:
         """Every two groups."""
         for pair in itertools.combinations(self.groups, 2):
-            a, b = ((group, [e for g, e in numbers if g == group and e is not None]) for group in pair)
+            a, b = (
+                (group, [e for g, e in numbers if g == group and e is not None]) for group in pair
+            )
             if min(len(a[1]), len(b[1])) > 1:
                 found = difference(quantity, a, b, 1 - self.options["alpha"])
                 left_out = sum(g in pair and e is None for g, e in numbers)
@@ -162,19 +180,23 @@ class StudyResult(Printed, Result, eqx.Module):
         return None if result is None else result.determined.get(quantity)
 
     def methods(self) -> str:
-        """A paragraph for the methods section of a paper: people, recordings, spectra, model, statistics, versions."""
+        """A paragraph for the methods section of a paper: people, recordings, spectra, model,
+        statistics, versions."""
         return methods_of_study(self)
 
     def plot(self, ax: "Axes | None" = None, *, proportional: bool = True) -> "Figure | SubFigure":
-        """Spectra of people and means of groups, a panel for each condition; see `jaxmuscle.plot.study`."""
+        """Spectra of people and means of groups, a panel for each condition; see
+        `jaxmuscle.plot.study`."""
         return plot.study(self, ax, proportional=proportional)
 
     def save(self, folder: str | os.PathLike[str], formats: Sequence[str] = ("png",)) -> None:
-        """Write people.csv, differences.csv, study.json, spectra.png, quantities.png and methods.txt into `folder`.
+        """Write people.csv, differences.csv, study.json, spectra.png, quantities.png and
+        methods.txt into `folder`.
 
-        They are made beside it first and then moved: a save that is interrupted changes nothing. Without a comparison there
-        is no differences.csv, and where the fits determine too little no quantities.png. `formats` of the figures: "png",
-        "pdf", "svg"; raises `ValueError` for another.
+        They are made beside it first and then moved: a save that is interrupted changes nothing.
+        Without a comparison there is no differences.csv, and where the fits determine too little no
+        quantities.png. `formats` of the figures: "png", "pdf", "svg"; raises `ValueError` for
+        another.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -182,12 +204,16 @@ class StudyResult(Printed, Result, eqx.Module):
             new = Path(made)
             self._write(new, formats)
             remove(folder, *FILES)
-            remove_figures(folder, "spectra", "quantities")  # an earlier study may have had more of them
+            # an earlier study may have had more of them
+            remove_figures(folder, "spectra", "quantities")
             for path in sorted(new.iterdir()):
                 os.replace(path, folder / path.name)
 
     def _write(self, folder: Path, formats: Sequence[str]) -> None:
-        tables = {"people.csv": self.table(), "differences.csv": [_row(d) for d in self.differences()]}
+        tables = {
+            "people.csv": self.table(),
+            "differences.csv": [_row(d) for d in self.differences()],
+        }
         for name, rows in tables.items():
             if rows:
                 write_text(folder / name, frame(rows).to_csv(index=False, float_format="%.8g"))
@@ -207,15 +233,36 @@ FILES = ("people.csv", "differences.csv", "study.json", "methods.txt")
 
 
 def _row(difference: Difference) -> dict[str, Any]:
-    names = ("kind", "quantity", "where", "a", "b", "difference", "low", "high", "unit", "p", "p_corrected")
+    names = (
+        "kind",
+        "quantity",
+        "where",
+        "a",
+        "b",
+        "difference",
+        "low",
+        "high",
+        "unit",
+        "p",
+        "p_corrected",
+    )
     people = dict(zip(("people_a", "people_b"), difference.members, strict=True))
-    return {name: getattr(difference, name) for name in names} | people | {"left_out": difference.left_out}
+    return (
+        {name: getattr(difference, name) for name in names}
+        | people
+        | {"left_out": difference.left_out}
+    )
 
 
 def to_table(study: StudyResult) -> dict[str, Any]:
     """What study.json holds."""
-    rows = [{name: with_nulls(value) if isinstance(value, float) else value for name, value in _row(d).items()}
-            for d in study.differences()]  # fmt: skip
+    rows = [
+        {
+            name: with_nulls(value) if isinstance(value, float) else value
+            for name, value in _row(d).items()
+        }
+        for d in study.differences()
+    ]
     return {
         "format": FORMAT,
         "source": study.source,
@@ -226,73 +273,127 @@ def to_table(study: StudyResult) -> dict[str, Any]:
         "differences": rows,
         "methods": study.methods(),
         "versions": versions(),
-    }  # fmt: skip
+    }
 
 
 def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
     target, result = cell.target, cohort.results.get(cell.target.name)
-    own = {"person": cell.person, "group": cell.group, "condition": cell.condition, "rates_hz": list(cell.rates),
-           "segments": list(target.segments or ()), "source": target.source, "notices": list(target.notices),
-           "dispersion": None if target.dispersion is None else target.dispersion[0], "mean": target.mean,
-           "unit": target.unit, "frequency_hz": target.frequency.tolist(),
-           "proportional_power": target.proportional_power.tolist()}  # fmt: skip
+    own = {
+        "person": cell.person,
+        "group": cell.group,
+        "condition": cell.condition,
+        "rates_hz": list(cell.rates),
+        "segments": list(target.segments or ()),
+        "source": target.source,
+        "notices": list(target.notices),
+        "dispersion": None if target.dispersion is None else target.dispersion[0],
+        "mean": target.mean,
+        "unit": target.unit,
+        "frequency_hz": target.frequency.tolist(),
+        "proportional_power": target.proportional_power.tolist(),
+    }
     if result is None:
         return own | {"failed": cohort.failed[target.name]}
-    return own | {"success": result.success, "verdict": result.verdict, "adequate": result.adequate,
-                  "adequacy_p": result.adequacy_p, "fitted": with_nulls(result.fitted),
-                  "estimates": estimates_to_table(result.found)}  # fmt: skip
+    return own | {
+        "success": result.success,
+        "verdict": result.verdict,
+        "adequate": result.adequate,
+        "adequacy_p": result.adequacy_p,
+        "fitted": with_nulls(result.fitted),
+        "estimates": estimates_to_table(result.found),
+    }
 
 
-def run_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]", *, rung: int | str | None = None,
-              noise: str | None = None, quantities: Iterable[str] | None = None, alpha: float | None = None,
-              correction: str | None = None, starts: int = 32, key: Key = 0, progress: bool | Tell = False,
-              window: Sequence[float | int] | str | None = None, column: str | int | None = None,
-              rate: float | int | None = None, units: str | None = None, axis: str | None = None,
-              reference: str | int | None = None, time: str | int | None = None, skip_rows: int | None = None,
-              max_gap: float | int | None = None, lever_arm: float | int | None = None, spectrum: str | None = None,
-              mvc: float | int | None = None) -> StudyResult:  # fmt: skip
+def run_study(
+    study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]",
+    *,
+    rung: int | str | None = None,
+    noise: str | None = None,
+    quantities: Iterable[str] | None = None,
+    alpha: float | None = None,
+    correction: str | None = None,
+    starts: int = 32,
+    key: Key = 0,
+    progress: bool | Tell = False,
+    window: Sequence[float | int] | str | None = None,
+    column: str | int | None = None,
+    rate: float | int | None = None,
+    units: str | None = None,
+    axis: str | None = None,
+    reference: str | int | None = None,
+    time: str | int | None = None,
+    skip_rows: int | None = None,
+    max_gap: float | int | None = None,
+    lever_arm: float | int | None = None,
+    spectrum: str | None = None,
+    mvc: float | int | None = None,
+) -> StudyResult:
     """Fit the recordings of a whole study with one model and compare groups and conditions.
 
         found = jm.run_study("study.csv")
         print(found)
         found.save("results")
 
-    The trials of a person in a condition make one target (`Trials.target`), each in its steady part. All targets are fitted
-    by `fit_cohort` with the same model, so that their numbers can be compared.
+    The trials of a person in a condition make one target (`Trials.target`), each in its steady
+    part. All targets are fitted by `fit_cohort` with the same model, so that their numbers can be
+    compared.
 
     **Arguments:**
 
-    - `study`: one of three things. A table (.csv, .tsv, .txt) with a line for each recording. It has the columns file
-      (relative to the table) and person; it may have group, condition, trial, window_start, window_stop and those of
-      the last item but window. Or a .toml with `table = "study.csv"` or `[[recordings]]` of the same fields, and any of the
-      options below but `starts`, `key` and `progress`. Or rows, as dictionaries.
-    - `rung`: the model of all people (`on_rung`), 0 to 3; by default 2, with activation and tremor. "auto" fits several and
-      takes the one whose AIC, summed over all targets, is lowest; that is three or four times as long.
+    - `study`: one of three things. A table (.csv, .tsv, .txt) with a line for each recording. It
+      has the columns file (relative to the table) and person; it may have group, condition, trial,
+      window_start, window_stop and those of the last item but window. Or a .toml with `table =
+      "study.csv"` or `[[recordings]]` of the same fields, and any of the options below but
+      `starts`, `key` and `progress`. Or rows, as dictionaries.
+    - `rung`: the model of all people (`on_rung`), 0 to 3; by default 2, with activation and tremor.
+      "auto" fits several and takes the one whose AIC, summed over all targets, is lowest; that is
+      three or four times as long.
     - `noise`: as in `fit`; `starts` of each fit; `key` of its random numbers.
-    - `quantities`: what is reported and compared. By default the derived quantities but `high_frequency_floor` are
-      compared, and all quantities reported. The fewer, the less the correction
-      costs.
+    - `quantities`: what is reported and compared. By default the derived quantities but
+      `high_frequency_floor` are compared, and all quantities reported. The fewer, the less the
+      correction costs.
     - `alpha`: level of the tests, by default 0.05. Intervals hold 1 - alpha.
-    - `correction` for many comparisons: "holm" (default), "fdr" or "none". All comparisons of one kind (groups, conditions,
-      interaction) are corrected together.
+    - `correction` for many comparisons: "holm" (default), "fdr" or "none". All comparisons of one
+      kind (groups, conditions, interaction) are corrected together.
     - `progress`: True or a function of (text, share).
-    - How files are read where a row does not say it: `window` (start, stop) [s] or "all" (by default the steady part);
-      `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap`, `lever_arm` as in `load_recording`;
-      `spectrum`, a name of settings, the same for all; `mvc` as in `Trials.target`.
+    - How files are read where a row does not say it: `window` (start, stop) [s] or "all" (by
+      default the steady part); `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`,
+      `max_gap`, `lever_arm` as in `load_recording`; `spectrum`, a name of settings, the same for
+      all; `mvc` as in `Trials.target`.
 
-    An option that is given here replaces that of the .toml; what a row says about its own file stays.
+    An option that is given here replaces that of the .toml; what a row says about its own file
+    stays.
 
     **Returns:** a `StudyResult`.
 
     **Raises:** `ValueError` naming file, line and column, or the argument, and the remedy.
     """
     check_key(key)
-    reading = {"window": window, "column": column, "rate": rate, "units": units, "axis": axis, "reference": reference,
-               "time": time, "skip_rows": skip_rows, "max_gap": max_gap, "lever_arm": lever_arm, "spectrum": spectrum,
-               "mvc": mvc}  # fmt: skip
+    reading = {
+        "window": window,
+        "column": column,
+        "rate": rate,
+        "units": units,
+        "axis": axis,
+        "reference": reference,
+        "time": time,
+        "skip_rows": skip_rows,
+        "max_gap": max_gap,
+        "lever_arm": lever_arm,
+        "spectrum": spectrum,
+        "mvc": mvc,
+    }
     table = read_study(study)
-    given = {"rung": rung, "noise": noise, "quantities": quantities, "alpha": alpha, "correction": correction} | reading
-    options = USUAL | table.options | {name: value for name, value in given.items() if value is not None}
+    given = {
+        "rung": rung,
+        "noise": noise,
+        "quantities": quantities,
+        "alpha": alpha,
+        "correction": correction,
+    } | reading
+    options = (
+        USUAL | table.options | {name: value for name, value in given.items() if value is not None}
+    )
     options = _checked(options)
     usual = {name: options.pop(name) for name in READING if name in options}
     options = options | {"starts": starts, "key": key}
@@ -307,36 +408,60 @@ def _checked(options: dict[str, Any]) -> dict[str, Any]:
     """The options, of whichever origin, fit for use."""
     rung, alpha, names = (options[name] for name in ("rung", "alpha", "quantities"))
     if rung != AUTO and (isinstance(rung, bool) or rung not in range(len(RUNGS))):
-        raise ValueError(f'rung = {rung!r}: give a rung of the ladder, 0 to {len(RUNGS) - 1}, or "auto"')
+        raise ValueError(
+            f'rung = {rung!r}: give a rung of the ladder, 0 to {len(RUNGS) - 1}, or "auto"'
+        )
     if isinstance(options.get("window"), str) and options["window"] != "all":
         raise ValueError(f'window = {options["window"]!r}: give (start, stop) in s, or "all"')
     if isinstance(alpha, bool | str) or not 0 < alpha < 1:
         raise ValueError(f"alpha = {alpha!r}: give a share between 0 and 1, as 0.05")
     if options["correction"] not in CORRECTIONS:
-        raise ValueError(f"correction = {options['correction']!r}: {choices(str(options['correction']), CORRECTIONS)}")
+        raise ValueError(
+            f"correction = {options['correction']!r}:"
+            f" {choices(str(options['correction']), CORRECTIONS)}"
+        )
     names = None if names is None else list(names)
     for name in names or ():
         if name not in DERIVED and name not in PARAMETERS:
             raise ValueError(f"quantities: unknown {name!r}; {choices(str(name), DERIVED)}")
-    return options | {"quantities": None if names is None else list(dict.fromkeys(ALIASES.get(n, n) for n in names))}
+    return options | {
+        "quantities": (
+            None if names is None else list(dict.fromkeys(ALIASES.get(n, n) for n in names))
+        )
+    }
 
 
-def _fitted(cells: list[Cell], options: dict[str, Any], tell: Tell) -> tuple[CohortResult, dict[int, float]]:
-    """The fits on the rung that is asked for, or on that of lowest AIC; and the AIC of each that was tried.
+def _fitted(
+    cells: list[Cell], options: dict[str, Any], tell: Tell
+) -> tuple[CohortResult, dict[int, float]]:
+    """The fits on the rung that is asked for, or on that of lowest AIC; and the AIC of each that
+    was tried.
 
-    What no model can be fitted to has no part in the choice. After the tremor, the first rung that gains nothing ends it.
+    What no model can be fitted to has no part in the choice. After the tremor, the first rung that
+    gains nothing ends it.
     """
     numbers = range(len(RUNGS)) if options["rung"] == AUTO else (options["rung"],)
-    labels = {cell.target.name: ", ".join(filter(None, (cell.group, cell.condition))) for cell in cells}
+    labels = {
+        cell.target.name: ", ".join(filter(None, (cell.group, cell.condition))) for cell in cells
+    }
     tried: dict[int, CohortResult] = {}
     aic: dict[int, float] = {}
     for number in numbers:
-        first, which = len(tried), f"model {number} (of models 0 to {numbers[-1]}): " * (len(numbers) > 1)
+        first, which = (
+            len(tried),
+            f"model {number} (of models 0 to {numbers[-1]}): " * (len(numbers) > 1),
+        )
         tried[number] = fit_cohort(
-            [cell.target for cell in cells], groups=labels, noise=options["noise"], rung=number, starts=options["starts"],
-            key=options["key"], progress=lambda text, share, which=which, i=first: tell(which + text,
-                                                                                      (i + share) / len(numbers)),
-        )  # fmt: skip
+            [cell.target for cell in cells],
+            groups=labels,
+            noise=options["noise"],
+            rung=number,
+            starts=options["starts"],
+            key=options["key"],
+            progress=lambda text, share, which=which, i=first: tell(
+                which + text, (i + share) / len(numbers)
+            ),
+        )
         table = np.array([[_aic(cohort, cell) for cell in cells] for cohort in tried.values()])
         table = table[:, np.isfinite(table).any(axis=0)]
         aic = dict(zip(tried, map(float, table.sum(axis=1)), strict=True))

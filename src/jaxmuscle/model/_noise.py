@@ -24,8 +24,9 @@ Amplitude = Scalar | tuple | list | dict | None
 class Realisation(eqx.Module):
     """One unit-amplitude noise path on a grid of `steps` steps.
 
-    `values` and `slopes` (N and dN/dt) hold at the `steps + 1` grid points, `increments` (of white noise) between them;
-    what a noise does not have is None. Of a sum, which has none of them, the path of each of its `parts`.
+    `values` and `slopes` (N and dN/dt) hold at the `steps + 1` grid points, `increments` (of white
+    noise) between them; what a noise does not have is None. Of a sum, which has none of them, the
+    path of each of its `parts`.
     """
 
     values: Float[Array, "*seeds points channels"] | None = None
@@ -35,11 +36,13 @@ class Realisation(eqx.Module):
 
 
 class Recursion(eqx.Module):
-    """One channel of a unit noise from grid point to grid point, exact in distribution: `q ← A q + L z`, z standard normals.
+    """One channel of a unit noise from grid point to grid point, exact in distribution: `q ← A q +
+    L z`, z standard normals.
 
-    `N = H q` at the grid points, `dN/dt = S q` if it is differentiable, and white noise has the increment `direct z`
-    between them. The states q are scaled to a stationary covariance of 1. An entry of A, L, H or S that is always zero may
-    be None. The methods take states and normals that are scalars or arrays (of channels, of seeds) alike.
+    `N = H q` at the grid points, `dN/dt = S q` if it is differentiable, and white noise has the
+    increment `direct z` between them. The states q are scaled to a stationary covariance of 1. An
+    entry of A, L, H or S that is always zero may be None. The methods take states and normals that
+    are scalars or arrays (of channels, of seeds) alike.
     """
 
     A: tuple[tuple[Scalar | None, ...], ...]
@@ -71,11 +74,14 @@ class Recursion(eqx.Module):
 
 
 def _dot(row: tuple[Scalar | None, ...], values: tuple[Array, ...]) -> Array:
-    return functools.reduce(operator.add, [a * x for a, x in zip(row, values, strict=True) if a is not None])
+    return functools.reduce(
+        operator.add, [a * x for a, x in zip(row, values, strict=True) if a is not None]
+    )
 
 
 class ShapingFilter(eqx.Module):
-    """A unit noise as filtered independent white noises w of density 1: `q' = F q + G w`, `N = H q + L w`."""
+    """A unit noise as filtered independent white noises w of density 1: `q' = F q + G w`, `N = H
+    q + L w`."""
 
     F: Float[Array, "states states"]
     G: Float[Array, "states inputs"]
@@ -84,12 +90,14 @@ class ShapingFilter(eqx.Module):
 
 
 class AbstractNoise(Spelled, eqx.Module):
-    """Noise on the coefficients K_w, K_z, C_w, C_z and the drive P_w, an independent channel each (`shared`: one for all).
+    """Noise on the coefficients K_w, K_z, C_w, C_z and the drive P_w, an independent channel each
+    (`shared`: one for all).
 
-    `amplitude` is one number for the four coefficients; or four; or five, the last for the drive; or a mapping by name. It
-    is a fraction of the base coefficient (`relative`) or in its unit [N/m, N s/m]; that of the drive is a fraction of P_w.
-    `smoothness`: 0 white (has no values), 1 continuous, 2 differentiable. The names of its parameters begin with the
-    class variable `sort`: "noise", if a class does not say otherwise ("resonance" for `ResonantNoise`).
+    `amplitude` is one number for the four coefficients; or four; or five, the last for the drive;
+    or a mapping by name. It is a fraction of the base coefficient (`relative`) or in its unit [N/m,
+    N s/m]; that of the drive is a fraction of P_w. `smoothness`: 0 white (has no values), 1
+    continuous, 2 differentiable. The names of its parameters begin with the class variable `sort`:
+    "noise", if a class does not say otherwise ("resonance" for `ResonantNoise`).
 
     Noises add: `BandLimitedNoise() + ResonantNoise()`.
     """
@@ -117,12 +125,14 @@ class AbstractNoise(Spelled, eqx.Module):
         """Raise a `ValueError` if a grid of step dt [s] is too coarse for this noise."""
 
     def draw(self, key: PRNGKeyArray, steps: int, draws: Draws = Draws()) -> Any:  # noqa: B008
-        """The standard normal numbers of one seed: a row that begins the noise and a row for each step.
+        """The standard normal numbers of one seed: a row that begins the noise and a row for each
+        step.
 
         `key` is the seed's own, that of seed i of a simulation `jax.random.fold_in(key, i)`.
 
-        Shape (steps + 1, n), n = `channels` times the `numbers` of `recursion`. White noise has only the rows of the steps;
-        a sum of noises has a tuple of these. `draws` says how the numbers are made.
+        Shape (steps + 1, n), n = `channels` times the `numbers` of `recursion`. White noise has
+        only the rows of the steps; a sum of noises has a tuple of these. `draws` says how the
+        numbers are made.
         """
         return self._drawn(Stream.of(key, draws), steps, 0)
 
@@ -135,10 +145,11 @@ class AbstractNoise(Spelled, eqx.Module):
         return jnp.concatenate([jnp.stack(stream.normals(START, part * APART, count))[None], later])
 
     def realise(self, normals: Any, dt: Scalar) -> Realisation:
-        """The unit path that the normals stand for, exact in distribution on the grid of step dt [s].
+        """The unit path that the normals stand for, exact in distribution on the grid of step dt
+        [s].
 
-        It has `values` N and `slopes` dN/dt at all grid points, or `increments` between them for white noise; None for
-        what a noise does not have. That of a sum has `parts` instead.
+        It has `values` N and `slopes` dN/dt at all grid points, or `increments` between them for
+        white noise; None for what a noise does not have. That of a sum has `parts` instead.
         """
         made = jax.tree.map(lambda x: jnp.asarray(x, normals.dtype), self.recursion(dt))
         rows = normals.reshape(len(normals), made.numbers, -1)  # of every channel
@@ -151,12 +162,17 @@ class AbstractNoise(Spelled, eqx.Module):
 
         begun = made.start(tuple(rows[0]))
         _, later = jax.lax.scan(advance, begun, rows[1:])
-        whole = tuple(jnp.concatenate([first[None], rest]) for first, rest in zip(begun, later, strict=True))
+        whole = tuple(
+            jnp.concatenate([first[None], rest]) for first, rest in zip(begun, later, strict=True)
+        )
         return Realisation(values=made.value(whole), slopes=made.slope(whole))
 
     def psd(self, f: Float[Array | np.ndarray, " frequencies"] | Scalar) -> Float[Array, "..."]:
-        """Two-sided power density `amplitude² density(f)` [amplitude²/Hz], one row per amplitude if there are several."""
-        return jnp.asarray(self.amplitude)[..., None] ** 2 * self.density(jnp.atleast_1d(jnp.asarray(f)))
+        """Two-sided power density `amplitude² density(f)` [amplitude²/Hz], one row per amplitude if
+        there are several."""
+        return jnp.asarray(self.amplitude)[..., None] ** 2 * self.density(
+            jnp.atleast_1d(jnp.asarray(f))
+        )
 
     def __add__(self, other: "AbstractNoise") -> "NoiseSum":
         if not isinstance(other, AbstractNoise):
@@ -168,7 +184,11 @@ class AbstractNoise(Spelled, eqx.Module):
         if np.ndim(self.amplitude) == 1:
             return self
         whole, count = isinstance(self.amplitude, jax.Array), self._channels_of_one_number
-        spread = jnp.broadcast_to(self.amplitude, (count,)) if whole else np.full(count, float(self.amplitude))
+        spread = (
+            jnp.broadcast_to(self.amplitude, (count,))
+            if whole
+            else np.full(count, float(self.amplitude))
+        )
         return eqx.tree_at(lambda n: n.amplitude, self, spread)
 
     _channels_of_one_number: ClassVar[int] = len(CHANNELS)
@@ -180,8 +200,15 @@ class AbstractNoise(Spelled, eqx.Module):
 
     @property
     def acts_on(self) -> tuple[int, ...]:
-        """Positions among `INPUTS` (the four coefficients, then the drive) of what it has an amplitude for."""
-        return ACTED_ON[np.shape(self.amplitude)[-1] if np.ndim(self.amplitude) else self._channels_of_one_number]
+        """Positions among `INPUTS` (the four coefficients, then the drive) of what it has an
+        amplitude for."""
+        return ACTED_ON[
+            (
+                np.shape(self.amplitude)[-1]
+                if np.ndim(self.amplitude)
+                else self._channels_of_one_number
+            )
+        ]
 
     @property
     def channels(self) -> int:
@@ -189,32 +216,46 @@ class AbstractNoise(Spelled, eqx.Module):
         return 1 if self.shared else len(self.acts_on)
 
 
-ACTED_ON = {1: (len(CHANNELS),), len(CHANNELS): tuple(range(len(CHANNELS))), len(INPUTS): tuple(range(len(INPUTS)))}
+ACTED_ON = {
+    1: (len(CHANNELS),),
+    len(CHANNELS): tuple(range(len(CHANNELS))),
+    len(INPUTS): tuple(range(len(INPUTS))),
+}
 
 
 def as_amplitude(value: Amplitude) -> Scalar:
-    """An amplitude in any form as what a noise keeps: the converter of the field `amplitude`, also of a noise of your own.
+    """An amplitude in any form as what a noise keeps: the converter of the field `amplitude`, also
+    of a noise of your own.
 
         jm.model.as_amplitude({"K_w": 0.02, "K_z": 0.005})
 
     A noise of your own has it as `eqx.field(converter=jm.model.as_amplitude, default=None)`.
 
-    **Arguments:** `value`, one number for the four coefficients (kept as it is); a list of four, or of five with the drive;
-    a dictionary by `K_w`, `K_z`, `C_w`, `C_z`, `P_w`, of which those left out are 0; or None, the defaults of the parameter
-    table. **Returns:** an array, or the number. **Raises:** `ValueError` for an unknown name or another number of entries.
+    **Arguments:** `value`, one number for the four coefficients (kept as it is); a list of four, or
+    of five with the drive; a dictionary by `K_w`, `K_z`, `C_w`, `C_z`, `P_w`, of which those left
+    out are 0; or None, the defaults of the parameter table. **Returns:** an array, or the number.
+    **Raises:** `ValueError` for an unknown name or another number of entries.
     """
     if value is None:
         return np.array([default(f"noise_{c}") for c in CHANNELS])
     if isinstance(value, dict):
         unknown = set(value) - set(INPUTS)
         if unknown:
-            raise ValueError(f"noise amplitude for unknown input {sorted(unknown)}: known: {', '.join(INPUTS)}")
+            raise ValueError(
+                f"noise amplitude for unknown input {sorted(unknown)}: known: {', '.join(INPUTS)}"
+            )
         value = [value.get(c, 0.0) for c in (INPUTS if "P_w" in value else CHANNELS)]
     if isinstance(value, tuple | list):
         if len(value) not in ACTED_ON:
-            raise ValueError(f"noise amplitude has {len(value)} entries: give one number, four for {', '.join(CHANNELS)}, "
-                             f"or five for these and the drive P_w")  # fmt: skip
-        return jnp.stack([jnp.asarray(v) for v in value]) if _any_jax(value) else np.array(value, dtype=float)
+            raise ValueError(
+                f"noise amplitude has {len(value)} entries: give one number, four for"
+                f" {', '.join(CHANNELS)}, or five for these and the drive P_w"
+            )
+        return (
+            jnp.stack([jnp.asarray(v) for v in value])
+            if _any_jax(value)
+            else np.array(value, dtype=float)
+        )
     return value
 
 
@@ -223,8 +264,12 @@ def _any_jax(values: tuple | list) -> bool:
 
 
 def check_amplitude(noise: AbstractNoise) -> None:
-    if np.ndim(noise.amplitude) and (np.ndim(noise.amplitude) > 1 or np.shape(noise.amplitude)[0] not in ACTED_ON):
-        raise ValueError(f"noise amplitude has shape {np.shape(noise.amplitude)}: give one number, four or five")
+    if np.ndim(noise.amplitude) and (
+        np.ndim(noise.amplitude) > 1 or np.shape(noise.amplitude)[0] not in ACTED_ON
+    ):
+        raise ValueError(
+            f"noise amplitude has shape {np.shape(noise.amplitude)}: give one number, four or five"
+        )
     require(noise.amplitude >= 0, f"noise amplitude {noise.amplitude} must not be negative")
 
 
@@ -250,7 +295,11 @@ class NoiseSum(AbstractNoise):
     def amplitude(self) -> Float[Array | np.ndarray, " amplitudes"]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The amplitudes of all parts, one after the other."""
         each = [part.amplitude for part in self.parts]
-        return jnp.concatenate(each) if any(not isinstance(a, np.ndarray) for a in each) else np.concatenate(each)
+        return (
+            jnp.concatenate(each)
+            if any(not isinstance(a, np.ndarray) for a in each)
+            else np.concatenate(each)
+        )
 
     @property
     def relative(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -263,7 +312,9 @@ class NoiseSum(AbstractNoise):
         return all(part.shared for part in self.parts)
 
     def density(self, f: Scalar) -> Scalar:
-        raise ValueError("a sum of noises has no density of unit amplitude: ask its components, or psd(f)")
+        raise ValueError(
+            "a sum of noises has no density of unit amplitude: ask its components, or psd(f)"
+        )
 
     def psd(self, f: Float[Array | np.ndarray, " frequencies"] | Scalar) -> Float[Array, "..."]:
         """Two-sided power density [amplitude²/Hz] of the sum, a row for each of `INPUTS`."""
@@ -277,7 +328,9 @@ class NoiseSum(AbstractNoise):
         return tuple(each._drawn(stream, steps, part + i) for i, each in enumerate(self.parts))
 
     def realise(self, normals: Any, dt: Scalar) -> Realisation:
-        return Realisation(parts=tuple(p.realise(own, dt) for p, own in zip(self.parts, normals, strict=True)))
+        return Realisation(
+            parts=tuple(p.realise(own, dt) for p, own in zip(self.parts, normals, strict=True))
+        )
 
     def recursion(self, dt: Scalar) -> Recursion:
         raise ValueError("a sum of noises has a recursion for each of its components")

@@ -28,11 +28,17 @@ def made_by_name(name: Any) -> AbstractNoise:
 
 
 def named_noise(name: str, needed: tuple[int, ...]) -> AbstractNoise:
-    """The noise of that name at its default amplitudes on the channels that a task can have it on, 0 on the others.
+    """The noise of that name at its default amplitudes on the channels that a task can have it on,
+    0 on the others.
 
-    `needed`: the smoothness that each channel needs there. If no channel can have it, none is left out: the task says why.
+    `needed`: the smoothness that each channel needs there. If no channel can have it, none is left
+    out: the task says why.
     """
     made = made_by_name(name)
     amplitude = np.asarray(made.amplitude)
     smooth = np.array([needed[i] for i in made.acts_on]) <= made.smoothness
-    return eqx.tree_at(lambda n: n.amplitude, made, np.where(smooth, amplitude, 0.0)) if smooth.any() else made
+    return (
+        eqx.tree_at(lambda n: n.amplitude, made, np.where(smooth, amplitude, 0.0))
+        if smooth.any()
+        else made
+    )

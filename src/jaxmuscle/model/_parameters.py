@@ -1,4 +1,5 @@
-"""The one table of parameters: symbol, unit, default, bounds, prior and source; and how a name finds its value."""
+"""The one table of parameters: symbol, unit, default, bounds, prior and source; and how a name
+finds its value."""
 
 import collections
 import dataclasses
@@ -13,36 +14,83 @@ import numpy as np
 from jaxmuscle._common.arrays import _is_scalar, checked, is_concrete, require
 from jaxmuscle._common.text import choices
 
-_HAND = "about the mass of a hand, 0.6 % of body mass (Winter 2009, Biomechanics, table 4.1); allows large time steps"
-_STIFF = "K_0 = k x_ref^2 = 200 N/m, about the postural stiffness of a hand (Mussa-Ivaldi et al. 1985)"
+_HAND = (
+    "about the mass of a hand, 0.6 % of body mass (Winter 2009, Biomechanics, table 4.1); allows"
+    " large time steps"
+)
+_STIFF = (
+    "K_0 = k x_ref^2 = 200 N/m, about the postural stiffness of a hand (Mussa-Ivaldi et al. 1985)"
+)
 _DAMP = (
-    "no measured damping: C_0 = c v_ref^2 of both tissues was chosen so that the slow eigenvalue of isometric force, -9.6/s "
-    "(1.5 Hz), is near the corner of force spectra (fits of the measured ones: 0.4 and 0.9 Hz)"
+    "no measured damping: C_0 = c v_ref^2 of both tissues was chosen so that the slow eigenvalue of"
+    " isometric force, -9.6/s (1.5 Hz), is near the corner of force spectra (fits of the measured"
+    " ones: 0.4 and 0.9 Hz)"
 )
 _REF = "sets the range over which the muscle is linear: displacements here are about 0.01 m"
 _REF_V = "sets the range over which the muscle is linear: velocities in a hold are far below 1 m/s"
 _HUMAN = "coefficient of variation of isometric force near 1 %, as people show"
 _PAPER_K = f"{_HUMAN}; the paper has 0.16 % of the initial stiffness coefficient"
 _PAPER_C = "the paper: 0.01 % of the initial damping coefficient"
-_TWITCH = "twitch contraction times of human muscles, 50 to 110 ms (Buchthal & Schmalbruch 1970, Acta Physiol Scand 79:435)"
+_TWITCH = (
+    "twitch contraction times of human muscles, 50 to 110 ms (Buchthal & Schmalbruch 1970, Acta"
+    " Physiol Scand 79:435)"
+)
 _TREMOR = "physiological tremor of hand and wrist, 8 to 12 Hz (Elble & Koller 1990, Tremor)"
 _SLOW = "a slower oscillation of wrist force seen near 3 to 4 Hz"
 
 
-def _row(name, symbol, unit, default, meaning, source, lower=0.0, upper=math.inf, sd=1.0, positive=True, **bounds):
-    return Parameter(name, symbol, unit, default, lower, upper, sd, positive, meaning, source, **bounds)
+def _row(
+    name,
+    symbol,
+    unit,
+    default,
+    meaning,
+    source,
+    lower=0.0,
+    upper=math.inf,
+    sd=1.0,
+    positive=True,
+    **bounds,
+):
+    return Parameter(
+        name, symbol, unit, default, lower, upper, sd, positive, meaning, source, **bounds
+    )
 
 
 def _free_sign(name, symbol, unit, default, meaning, source, sd):
     bounds = {"fit_lower": -math.inf, "fit_upper": math.inf}
-    return _row(name, symbol, unit, default, meaning, source, -math.inf, math.inf, sd, positive=False, **bounds)
+    return _row(
+        name,
+        symbol,
+        unit,
+        default,
+        meaning,
+        source,
+        -math.inf,
+        math.inf,
+        sd,
+        positive=False,
+        **bounds,
+    )
 
 
-DEFAULT_FREE = ("k_w", "k_z", "c_w", "c_z", "harmonic_amplitude", "harmonic_frequency", "noise_K_w", "noise_K_z")
+DEFAULT_FREE = (
+    "k_w",
+    "k_z",
+    "c_w",
+    "c_z",
+    "harmonic_amplitude",
+    "harmonic_frequency",
+    "noise_K_w",
+    "noise_K_z",
+)
 HARMONIC = ("harmonic_amplitude", "harmonic_frequency")
 RESONANCES = ("resonance", "resonance_2")
-RESONANCE = tuple(f"{which}_{what}" for which in RESONANCES for what in ("amplitude", "frequency", "width"))
-USUALLY_FREE = (*DEFAULT_FREE, "noise_correlation_time", "activation_time", *RESONANCE)  # where a task has them
+RESONANCE = tuple(
+    f"{which}_{what}" for which in RESONANCES for what in ("amplitude", "frequency", "width")
+)
+# where a task has them
+USUALLY_FREE = (*DEFAULT_FREE, "noise_correlation_time", "activation_time", *RESONANCE)
 CHANNELS = ("K_w", "K_z", "C_w", "C_z")
 INPUTS = (*CHANNELS, "P_w")
 
@@ -53,11 +101,12 @@ def default(name: str) -> float:
 
 
 class Parameter(NamedTuple):
-    """One row of the parameter table: `name`, `symbol`, `unit`, `default`, `meaning`, and the `source` of the default.
+    """One row of the parameter table: `name`, `symbol`, `unit`, `default`, `meaning`, and the
+    `source` of the default.
 
-    `lower` and `upper` bound what is physically possible, `fit_lower` and `fit_upper` what a fit may reach.
-    A positive parameter is fitted in log space; `prior_sd` is then the standard deviation of its logarithm,
-    otherwise it is in the parameter's own unit.
+    `lower` and `upper` bound what is physically possible, `fit_lower` and `fit_upper` what a fit
+    may reach. A positive parameter is fitted in log space; `prior_sd` is then the standard
+    deviation of its logarithm, otherwise it is in the parameter's own unit.
     """
 
     name: str
@@ -76,7 +125,9 @@ class Parameter(NamedTuple):
     @property
     def range(self) -> str:
         """What is physically possible, in words."""
-        low, high = (None if math.isinf(bound) else f"{bound:g}" for bound in (self.lower, self.upper))
+        low, high = (
+            None if math.isinf(bound) else f"{bound:g}" for bound in (self.lower, self.upper)
+        )
         if low is None:
             return "any number" if high is None else f"{high} or less"
         return f"{low} or more" if high is None else f"{low} to {high}"
@@ -85,7 +136,8 @@ class Parameter(NamedTuple):
 PARAMETERS: dict[str, Parameter] = {
     row.name: row
     for row in (
-        _row("m_w", "m_w", "kg", 0.5, "active mass", _HAND, sd=0.5),  # no data tell it: its prior goes into all errors
+        # no data tell it: its prior goes into all errors
+        _row("m_w", "m_w", "kg", 0.5, "active mass", _HAND, sd=0.5),
         _row("m_z", "m_z", "kg", 0.5, "passive mass", _HAND),
         _row("k_w", "k_w", "N/m^3", 5e5, "active stiffness factor", _STIFF),
         _row("k_z", "k_z", "N/m^3", 5e5, "passive stiffness factor", _STIFF),
@@ -99,32 +151,138 @@ PARAMETERS: dict[str, Parameter] = {
         _row("noise_K_z", "σ_Kz/K_z0", "1", 0.005, "noise on passive stiffness", _PAPER_K),
         _row("noise_C_w", "σ_Cw/C_w0", "1", 1e-4, "noise on active damping", _PAPER_C),
         _row("noise_C_z", "σ_Cz/C_z0", "1", 1e-4, "noise on passive damping", _PAPER_C),
-        _row("noise_cutoff", "f_c", "Hz", 50.0, "corner of band-limited noise",
-             "half of 100 Hz, to which recordings are resampled"),
-        _row("noise_correlation_time", "τ", "s", 0.1, "correlation time of Ornstein-Uhlenbeck noise",
-             "most fits of measured force: 0.07 to 0.3 s", fit_lower=0.005, fit_upper=5.0),
+        _row(
+            "noise_cutoff",
+            "f_c",
+            "Hz",
+            50.0,
+            "corner of band-limited noise",
+            "half of 100 Hz, to which recordings are resampled",
+        ),
+        _row(
+            "noise_correlation_time",
+            "τ",
+            "s",
+            0.1,
+            "correlation time of Ornstein-Uhlenbeck noise",
+            "most fits of measured force: 0.07 to 0.3 s",
+            fit_lower=0.005,
+            fit_upper=5.0,
+        ),
         _row("harmonic_amplitude", "A/K_0", "1", 0.003, "harmonic amplitude", _HUMAN),
-        _row("harmonic_frequency", "f_S", "Hz", 4.25, "harmonic frequency", "the paper: local maximum at 4.251 Hz",
-             fit_lower=0.2, fit_upper=30.0),
-        _row("noise_P_w", "σ_Pw", "1", 0.02, "noise on the drive, a fraction of P_w; off by default", _HUMAN),
-        _row("activation_time", "T", "s", 0.06, "contraction time of a twitch; 0, the default of a task, is none", _TWITCH,
-             sd=1.0, fit_lower=0.005, fit_upper=0.5),
-        _row("resonance_amplitude", "σ_1", "1", 0.005, "tremor of the drive, a fraction of P_w", _HUMAN),
-        _row("resonance_frequency", "f_1", "Hz", 9.0, "frequency of the tremor", _TREMOR, sd=0.25,
-             fit_lower=0.5, fit_upper=30.0),
-        _row("resonance_width", "b_1", "Hz", 2.0, "full width of the tremor at half power", _TREMOR, sd=0.7,
-             fit_lower=0.02, fit_upper=15.0),
-        _row("resonance_2_amplitude", "σ_2", "1", 0.005, "a second resonance of the drive, a fraction of P_w", _HUMAN),
-        _row("resonance_2_frequency", "f_2", "Hz", 3.5, "frequency of the second resonance", _SLOW, sd=0.35,
-             fit_lower=0.5, fit_upper=30.0),
-        _row("resonance_2_width", "b_2", "Hz", 1.0, "full width of the second resonance at half power", _SLOW, sd=0.7,
-             fit_lower=0.02, fit_upper=15.0),
-        _free_sign("harmonic_phase", "φ", "rad", 0.0, "harmonic phase", "unknown; hardly any influence above 1 Hz", math.pi),
-        _row("P_w", "P_w", "N", 5.0, "active force level", "light pressing, displacement near 0.01 m", -math.inf),
+        _row(
+            "harmonic_frequency",
+            "f_S",
+            "Hz",
+            4.25,
+            "harmonic frequency",
+            "the paper: local maximum at 4.251 Hz",
+            fit_lower=0.2,
+            fit_upper=30.0,
+        ),
+        _row(
+            "noise_P_w",
+            "σ_Pw",
+            "1",
+            0.02,
+            "noise on the drive, a fraction of P_w; off by default",
+            _HUMAN,
+        ),
+        _row(
+            "activation_time",
+            "T",
+            "s",
+            0.06,
+            "contraction time of a twitch; 0, the default of a task, is none",
+            _TWITCH,
+            sd=1.0,
+            fit_lower=0.005,
+            fit_upper=0.5,
+        ),
+        _row(
+            "resonance_amplitude",
+            "σ_1",
+            "1",
+            0.005,
+            "tremor of the drive, a fraction of P_w",
+            _HUMAN,
+        ),
+        _row(
+            "resonance_frequency",
+            "f_1",
+            "Hz",
+            9.0,
+            "frequency of the tremor",
+            _TREMOR,
+            sd=0.25,
+            fit_lower=0.5,
+            fit_upper=30.0,
+        ),
+        _row(
+            "resonance_width",
+            "b_1",
+            "Hz",
+            2.0,
+            "full width of the tremor at half power",
+            _TREMOR,
+            sd=0.7,
+            fit_lower=0.02,
+            fit_upper=15.0,
+        ),
+        _row(
+            "resonance_2_amplitude",
+            "σ_2",
+            "1",
+            0.005,
+            "a second resonance of the drive, a fraction of P_w",
+            _HUMAN,
+        ),
+        _row(
+            "resonance_2_frequency",
+            "f_2",
+            "Hz",
+            3.5,
+            "frequency of the second resonance",
+            _SLOW,
+            sd=0.35,
+            fit_lower=0.5,
+            fit_upper=30.0,
+        ),
+        _row(
+            "resonance_2_width",
+            "b_2",
+            "Hz",
+            1.0,
+            "full width of the second resonance at half power",
+            _SLOW,
+            sd=0.7,
+            fit_lower=0.02,
+            fit_upper=15.0,
+        ),
+        _free_sign(
+            "harmonic_phase",
+            "φ",
+            "rad",
+            0.0,
+            "harmonic phase",
+            "unknown; hardly any influence above 1 Hz",
+            math.pi,
+        ),
+        _row(
+            "P_w",
+            "P_w",
+            "N",
+            5.0,
+            "active force level",
+            "light pressing, displacement near 0.01 m",
+            -math.inf,
+        ),
         _free_sign("F_ext", "F_ext", "N", 0.0, "external force level", "the paper's Task 2", 5.0),
-        _free_sign("x_z", "x_z", "m", 0.0, "displacement of the insertion", "the paper: held", 0.01),
+        _free_sign(
+            "x_z", "x_z", "m", 0.0, "displacement of the insertion", "the paper: held", 0.01
+        ),
     )
-}  # fmt: skip
+}
 
 
 def muscle_paths(muscle: Any) -> dict[str, tuple]:
@@ -143,11 +301,14 @@ def muscle_paths(muscle: Any) -> dict[str, tuple]:
 
 def _dynamic_fields(module: Any) -> list[tuple[str, Any]]:
     fields = dataclasses.fields(module)
-    return [(f.name, getattr(module, f.name)) for f in fields if not f.metadata.get("static", False)]
+    return [
+        (f.name, getattr(module, f.name)) for f in fields if not f.metadata.get("static", False)
+    ]
 
 
 def paths_of(task: Any) -> dict[str, tuple]:
-    """Name and path of every parameter of a task: the muscle's, the noise's, the harmonic's and the input levels."""
+    """Name and path of every parameter of a task: the muscle's, the noise's, the harmonic's and the
+    input levels."""
     paths = muscle_paths(task.muscle)
     paths |= _noise_paths(task.noise)
     if task.activation is not None:
@@ -157,12 +318,15 @@ def paths_of(task: Any) -> dict[str, tuple]:
     fields = {field.name for field in dataclasses.fields(task)}
     for field in ("P_w", "F_ext", "x_z"):
         if field in fields:
-            paths[field] = (field, "level") if isinstance(getattr(task, field), eqx.Module) else (field,)
+            paths[field] = (
+                (field, "level") if isinstance(getattr(task, field), eqx.Module) else (field,)
+            )
     return paths
 
 
 def _noise_paths(noise: Any) -> dict[str, tuple]:
-    """Of a sum: `noise_` and `resonance_`, then `noise_2_` and so on for further ones of the same sort."""
+    """Of a sum: `noise_` and `resonance_`, then `noise_2_` and so on for further ones of the same
+    sort."""
     paths: dict[str, tuple] = {}
     counts = collections.Counter()
     for i, part in enumerate(noise.components):
@@ -173,7 +337,11 @@ def _noise_paths(noise: Any) -> dict[str, tuple]:
         if part.sort == "resonance" and len(inputs) == 1:
             inputs = ["amplitude"]
         paths |= {f"{first}{name}": (*here, "amplitude", k) for k, name in enumerate(inputs)}
-        others = [field for field, value in _dynamic_fields(part) if field != "amplitude" and _is_scalar(value)]
+        others = [
+            field
+            for field, value in _dynamic_fields(part)
+            if field != "amplitude" and _is_scalar(value)
+        ]
         paths |= {f"{first}{field}": (*here, field) for field in others}
     return paths
 
@@ -182,12 +350,19 @@ def names_of(task: Any, part: Any) -> list[str]:
     """Names of one component's amplitudes on the four coefficients."""
     where = next(i for i, each in enumerate(task.noise.components) if each is part)
     here = ("noise",) if part is task.noise else ("noise", "parts", where)
-    return [n for n, path in paths_of(task).items() if path[:-1] == (*here, "amplitude") and part.acts_on[path[-1]] < 4]
+    return [
+        n
+        for n, path in paths_of(task).items()
+        if path[:-1] == (*here, "amplitude") and part.acts_on[path[-1]] < 4
+    ]
 
 
 def amplitude_names(task: Any) -> tuple[str, ...]:
     """Names of the amplitudes of noise and harmonic, which a common factor makes louder."""
-    return (*(n for n, path in paths_of(task).items() if "amplitude" in path and path[0] == "noise"), "harmonic_amplitude")
+    return (
+        *(n for n, path in paths_of(task).items() if "amplitude" in path and path[0] == "noise"),
+        "harmonic_amplitude",
+    )
 
 
 OFF = ("activation_time", "noise_P_w")
@@ -197,11 +372,17 @@ SYNONYMS = {
     "tremor_width": "resonance_width",
     "contraction_time": "activation_time",
 }
-BASE = {"K_w0": "k_w x_ref_w^2", "K_z0": "k_z x_ref_z^2", "C_w0": "c_w v_ref_w^2", "C_z0": "c_z v_ref_z^2"}
+BASE = {
+    "K_w0": "k_w x_ref_w^2",
+    "K_z0": "k_z x_ref_z^2",
+    "C_w0": "c_w v_ref_w^2",
+    "C_z0": "c_z v_ref_z^2",
+}
 
 
 def proper(name: str) -> str:
-    """The name of a parameter in the parameter table: that of "tremor_width" is "resonance_width"; of one target's, too."""
+    """The name of a parameter in the parameter table: that of "tremor_width" is "resonance_width";
+    of one target's, too."""
     own, at, target = name.partition("@")
     return SYNONYMS.get(own, own) + at + target
 
@@ -210,9 +391,15 @@ def usually_free(task: Any, usual: Iterable[str] = USUALLY_FREE) -> tuple[str, .
     """What a fit lets free by default: of the `usual` parameters those that are not 0."""
     values = {name: value_of(task, path) for name, path in paths_of(task).items()}
     # Nothing shows the frequency of what has no amplitude.
-    still = [n.removesuffix("amplitude") for n, v in values.items() if n.endswith("_amplitude") and not _positive(v)]
+    still = [
+        n.removesuffix("amplitude")
+        for n, v in values.items()
+        if n.endswith("_amplitude") and not _positive(v)
+    ]
     unseen = tuple(f"{of}{what}" for of in still for what in ("frequency", "width"))
-    return tuple(n for n in usual if n in values and _positive(values[n]) and not n.startswith(unseen))
+    return tuple(
+        n for n in usual if n in values and _positive(values[n]) and not n.startswith(unseen)
+    )
 
 
 def _positive(value: Any) -> bool:
@@ -220,7 +407,8 @@ def _positive(value: Any) -> bool:
 
 
 def value_of(task: Any, path: tuple) -> Any:
-    """The value at a path, without a computation of JAX; of an array of amplitudes that cannot be looked at the whole."""
+    """The value at a path, without a computation of JAX; of an array of amplitudes that cannot be
+    looked at the whole."""
     if not isinstance(path[-1], int):
         return _follow(task, path)
     node = _follow(task, path[:-1])
@@ -228,7 +416,8 @@ def value_of(task: Any, path: tuple) -> Any:
 
 
 def get_parameter(task: Any, name: str) -> Any:
-    """Value of a parameter by name, or of a base coefficient (`BASE`); 0 of a parameter that is switched off."""
+    """Value of a parameter by name, or of a base coefficient (`BASE`); 0 of a parameter that is
+    switched off."""
     name = proper(name)
     if name in BASE:
         return task.muscle.base()[tuple(BASE).index(name)]
@@ -238,7 +427,8 @@ def get_parameter(task: Any, name: str) -> Any:
 
 
 def set_parameters(task: Any, values: dict[str, Any]) -> Any:
-    """A copy of the task with the named values, validated as a constructor would; what is off is switched on."""
+    """A copy of the task with the named values, validated as a constructor would; what is off is
+    switched on."""
     return checked(assigned(task, values))
 
 
@@ -247,7 +437,10 @@ def assigned(task: Any, values: dict[str, Any]) -> Any:
     values = proper_values(values)
     time = values.get("activation_time")
     if time is not None and is_concrete(time) and float(time) == 0:
-        task, values = task.with_parts(activation=None), {n: v for n, v in values.items() if n != "activation_time"}
+        task, values = (
+            task.with_parts(activation=None),
+            {n: v for n, v in values.items() if n != "activation_time"},
+        )
     off = [name for name in OFF if name in values and name not in paths_of(task)]
     task = _with_values(task, {name: value for name, value in values.items() if name not in off})
     for name in off:
@@ -256,25 +449,35 @@ def assigned(task: Any, values: dict[str, Any]) -> Any:
 
 
 def proper_values(values: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What is given by names, by those in the parameter table. Raises `ValueError` for one parameter under two names."""
+    """What is given by names, by those in the parameter table. Raises `ValueError` for one
+    parameter under two names."""
     values = values or {}
     named = {proper(name): value for name, value in values.items()}
     if len(named) < len(values):
         twice = sorted(name for name in values if proper(name) != name and proper(name) in values)
-        raise ValueError(f"{twice[0]} and {proper(twice[0])} are the same parameter: give one of them")
+        raise ValueError(
+            f"{twice[0]} and {proper(twice[0])} are the same parameter: give one of them"
+        )
     return named
 
 
 def _with_values(task: Any, values: dict[str, Any]) -> Any:
     for name, value in values.items():
         row = PARAMETERS.get(name)
-        if name in {field.name for field in dataclasses.fields(task)} and isinstance(value, str | eqx.Module):
-            raise ValueError(f"{name} = {value!r}: it is a part of the task, not a number; use task.with_parts({name}=...)")
+        if name in {field.name for field in dataclasses.fields(task)} and isinstance(
+            value, str | eqx.Module
+        ):
+            raise ValueError(
+                f"{name} = {value!r}: it is a part of the task, not a number; use"
+                f" task.with_parts({name}=...)"
+            )
         if isinstance(value, bool | str | complex | None) or callable(value):
             raise ValueError(f"{name} = {value!r}: give a number")
         if np.ndim(value) > 0:
-            raise ValueError(f"{name} has the shape {np.shape(value)}: a parameter is one number. For several tasks use "
-                             f"jaxmuscle.Sweep.grid(task, {name}=[...]), or jax.vmap")  # fmt: skip
+            raise ValueError(
+                f"{name} has the shape {np.shape(value)}: a parameter is one number. For several"
+                f" tasks use jaxmuscle.Sweep.grid(task, {name}=[...]), or jax.vmap"
+            )
         if row is not None:
             unit = "" if row.unit == "1" else f" {row.unit}"
             message = f"{name} = {value}{unit} is outside its range, {row.range}: {row.meaning}"
@@ -289,12 +492,15 @@ def _with_values(task: Any, values: dict[str, Any]) -> Any:
             parts = [node[i] for i in range(len(node))]
             parts[index] = value
             value = _stack(parts)
-        task = eqx.tree_at(lambda t, f=fields: _follow(t, f), task, value, is_leaf=lambda x: x is None)
+        task = eqx.tree_at(
+            lambda t, f=fields: _follow(t, f), task, value, is_leaf=lambda x: x is None
+        )
     return task
 
 
 def _stack(parts: list[Any]) -> Any:
-    """Scalars to one array: NumPy's as long as all are concrete, so that nothing is rounded before it must be."""
+    """Scalars to one array: NumPy's as long as all are concrete, so that nothing is rounded before
+    it must be."""
     if any(isinstance(p, jax.Array) for p in parts):
         return jax.numpy.stack([jax.numpy.asarray(p) for p in _same_dtype(parts)])
     return np.array([float(p) for p in parts])
@@ -324,9 +530,13 @@ def proper_names(names: Iterable[str] | None) -> tuple[str, ...] | None:
     return None if names is None else tuple(map(proper, names))
 
 
-def unknown_parameter(name: str, known: Iterable[str], *, of: str = "", what: str = "unknown parameter") -> str:
+def unknown_parameter(
+    name: str, known: Iterable[str], *, of: str = "", what: str = "unknown parameter"
+) -> str:
     """The message about a name that is not that of a parameter that can be set or fitted."""
     if name in BASE:
-        return (f"{name} is not a parameter but follows from some ({BASE[name]} in the paper's muscle): it can be read, not "
-                f"set or fitted. Give {name[0].lower()}{name[1:3]} instead")  # fmt: skip
+        return (
+            f"{name} is not a parameter but follows from some ({BASE[name]} in the paper's muscle):"
+            f" it can be read, not set or fitted. Give {name[0].lower()}{name[1:3]} instead"
+        )
     return f"{what} {name!r}{of}: {choices(name, known)}"

@@ -11,18 +11,33 @@ from jaxmuscle._common.matrices import exponential
 from jaxmuscle._common.quadrature import NODES, WEIGHTS
 from jaxmuscle._common.types import Scalar
 
-from ._noise import AbstractNoise, Amplitude, Recursion, ShapingFilter, as_amplitude, check_amplitude
+from ._noise import (
+    AbstractNoise,
+    Amplitude,
+    Recursion,
+    ShapingFilter,
+    as_amplitude,
+    check_amplitude,
+)
 from ._parameters import PARAMETERS
 
 
-def exact_step(made: ShapingFilter, dt: Scalar) -> tuple[Float[Array, "states states"], Float[Array, "states states"]]:
-    """Transition Φ = exp(F dt) of a filter over a step, and L with `L Lᵀ = ∫ exp(F s) G Gᵀ exp(Fᵀ s) ds` over it.
+def exact_step(
+    made: ShapingFilter, dt: Scalar
+) -> tuple[Float[Array, "states states"], Float[Array, "states states"]]:
+    """Transition Φ = exp(F dt) of a filter over a step, and L with `L Lᵀ = ∫ exp(F s) G Gᵀ exp(Fᵀ
+    s) ds` over it.
 
-    By Gauss-Legendre quadrature, a sum of squares: of `P - Φ P Φᵀ` short steps leave no digits in single precision.
+    By Gauss-Legendre quadrature, a sum of squares: of `P - Φ P Φᵀ` short steps leave no digits in
+    single precision.
     """
     size = len(made.F)
-    steps = exponential(made.F * dt * jnp.append(jnp.asarray(NODES, made.F.dtype), 1.0)[:, None, None])
-    kicks = jnp.moveaxis(steps[:-1] @ made.G * jnp.sqrt(dt * jnp.asarray(WEIGHTS, made.F.dtype))[:, None, None], 0, 1)
+    steps = exponential(
+        made.F * dt * jnp.append(jnp.asarray(NODES, made.F.dtype), 1.0)[:, None, None]
+    )
+    kicks = jnp.moveaxis(
+        steps[:-1] @ made.G * jnp.sqrt(dt * jnp.asarray(WEIGHTS, made.F.dtype))[:, None, None], 0, 1
+    )
     kicks = kicks.reshape(size, -1)
     # Rows of unit length, so that rounding is relative to each.
     scale = jnp.sqrt(jnp.sum(kicks**2, axis=1))
@@ -31,16 +46,18 @@ def exact_step(made: ShapingFilter, dt: Scalar) -> tuple[Float[Array, "states st
 
 
 class ResonantNoise(AbstractNoise):
-    """A tremor: white noise through a resonance, `S(f) = std² (b/π) f² / ((f0² - f²)² + b² f²)`, ∫ S df = std².
+    """A tremor: white noise through a resonance, `S(f) = std² (b/π) f² / ((f0² - f²)² + b² f²)`, ∫
+    S df = std².
 
-    Two-sided density, f0 the `frequency` and b the `width`: the full width at half power. Without power at 0. In the time
-    domain `N' = -2πb N - 2πf0 q + std √(4πb) w`, `q' = 2πf0 N`; N and q have the variance std². As b → 0 it becomes a line
-    whose phase and amplitude are random (Rayleigh). Continuous, not differentiable.
+    Two-sided density, f0 the `frequency` and b the `width`: the full width at half power. Without
+    power at 0. In the time domain `N' = -2πb N - 2πf0 q + std √(4πb) w`, `q' = 2πf0 N`; N and q
+    have the variance std². As b → 0 it becomes a line whose phase and amplitude are random
+    (Rayleigh). Continuous, not differentiable.
 
     **Arguments:**
 
-    - `std`: the standard deviation. One number is that of the drive, a fraction of P_w; four or five, or a mapping, as in
-      `AbstractNoise`
+    - `std`: the standard deviation. One number is that of the drive, a fraction of P_w; four or
+      five, or a mapping, as in `AbstractNoise`
     - `frequency` [Hz] > 0, `width` [Hz] > 0
     - `relative`, `shared`: as in `AbstractNoise`
     """
@@ -84,11 +101,14 @@ class ResonantNoise(AbstractNoise):
         omega, rate = 2 * jnp.pi * jnp.asarray(self.frequency), 2 * jnp.pi * jnp.asarray(self.width)
         none = jnp.zeros_like(omega + rate)
         F = jnp.stack([jnp.stack([none, omega]), jnp.stack([-omega, -rate])])
-        return ShapingFilter(F, jnp.stack([none, jnp.sqrt(2 * rate)])[:, None], jnp.array([0.0, 1.0]), jnp.zeros(1))
+        return ShapingFilter(
+            F, jnp.stack([none, jnp.sqrt(2 * rate)])[:, None], jnp.array([0.0, 1.0]), jnp.zeros(1)
+        )
 
     def check_step(self, dt: float) -> None:
         require(
             (self.frequency + self.width) * dt <= 0.1,
-            f"dt = {dt} s is too coarse for a resonance at {self.frequency} Hz, {self.width} Hz wide: use "
-            f"dt <= 0.1 / (resonance_frequency + resonance_width) = {0.1 / (self.frequency + self.width)} s",
+            f"dt = {dt} s is too coarse for a resonance at {self.frequency} Hz, {self.width} Hz"
+            " wide: use dt <= 0.1 / (resonance_frequency + resonance_width) ="
+            f" {0.1 / (self.frequency + self.width)} s",
         )

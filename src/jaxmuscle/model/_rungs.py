@@ -11,7 +11,8 @@ RUNGS = (
     "with tremor instead of the harmonic",
     "with a second resonance",
 )
-RICHER = {"activation": 1, "tremor": 2, "two resonances": 3}  # what a comparison calls them, with the task's own noise
+# what a comparison calls them, with the task's own noise
+RICHER = {"activation": 1, "tremor": 2, "two resonances": 3}
 QUIET, NOISE_ALONE = -1, "noise alone"  # below the base model
 
 
@@ -26,16 +27,19 @@ def on_rung(task: AbstractTask, rung: int) -> AbstractTask:
         task = jm.on_rung(jm.Isometric(), 2)  # with activation and tremor
         task["tremor_frequency"]
 
-    0, as it is; 1, with an `Activation` between the nervous drive and the active tissue; 2, with a `ResonantNoise` on the
-    drive as well, the tremor, instead of the harmonic; 3, with a second resonance. Each begins at the default of the
-    parameter table.
+    0, as it is; 1, with an `Activation` between the nervous drive and the active tissue; 2, with a
+    `ResonantNoise` on the drive as well, the tremor, instead of the harmonic; 3, with a second
+    resonance. Each begins at the default of the parameter table.
 
-    **Raises:** `ValueError` for other rungs, and for a task that has an activation or a resonance already.
+    **Raises:** `ValueError` for other rungs, and for a task that has an activation or a resonance
+    already.
     """
     if rung not in range(len(RUNGS)):
         raise ValueError(f"rung = {rung} must be one of 0 to {len(RUNGS) - 1}")
     if not is_base(task):
-        raise ValueError("this task has an activation or a resonance already: start from one without")
+        raise ValueError(
+            "this task has an activation or a resonance already: start from one without"
+        )
     if rung >= 1:
         task = task.with_parts(activation=Activation())
     for which in ("resonance", "resonance_2")[: max(rung - 1, 0)]:
@@ -46,4 +50,6 @@ def on_rung(task: AbstractTask, rung: int) -> AbstractTask:
 
 def is_base(task: AbstractTask) -> bool:
     """Whether a task has neither activation nor resonance."""
-    return task.activation is None and not any(isinstance(noise, ResonantNoise) for noise in task.noise.components)
+    return task.activation is None and not any(
+        isinstance(noise, ResonantNoise) for noise in task.noise.components
+    )

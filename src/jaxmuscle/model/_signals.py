@@ -1,4 +1,5 @@
-"""Functions of time: inputs (constant, smooth step, ramp and hold, decay, sampled) and the harmonic."""
+"""Functions of time: inputs (constant, smooth step, ramp and hold, decay, sampled) and the
+harmonic."""
 
 import abc
 from collections.abc import Callable
@@ -44,15 +45,16 @@ class Constant(AbstractSignal):
 
 
 class Harmonic(Spelled, eqx.Module):
-    """`S(t) = amplitude envelope(t) sin(2π frequency t + phase)`, a fraction of the base stiffness K_j0 of both tissues.
+    """`S(t) = amplitude envelope(t) sin(2π frequency t + phase)`, a fraction of the base stiffness
+    K_j0 of both tissues.
 
-    **Arguments:** `amplitude` >= 0 (fraction of K_j0), `frequency` [Hz] > 0, `phase` [rad], `envelope` (a signal with
-    at least one continuous derivative; constant 1 by default).
+    **Arguments:** `amplitude` >= 0 (fraction of K_j0), `frequency` [Hz] > 0, `phase` [rad],
+    `envelope` (a signal with at least one continuous derivative; constant 1 by default).
 
     **Raises:** `ValueError` for a negative amplitude or a frequency that is not positive.
 
-    **Source:** the paper, S(t) in equation (2). In its simulation of [12] the amplitude of the harmonic changes in time:
-    that is what the envelope is for.
+    **Source:** the paper, S(t) in equation (2). In its simulation of [12] the amplitude of the
+    harmonic changes in time: that is what the envelope is for.
     """
 
     amplitude: Scalar = default("harmonic_amplitude")
@@ -61,21 +63,29 @@ class Harmonic(Spelled, eqx.Module):
     envelope: AbstractSignal = eqx.field(default_factory=lambda: Constant(1.0))
 
     def __check_init__(self):
-        require(self.amplitude >= 0, f"harmonic_amplitude = {self.amplitude} must not be negative: shift the phase")
+        require(
+            self.amplitude >= 0,
+            f"harmonic_amplitude = {self.amplitude} must not be negative: shift the phase",
+        )
         require(self.frequency > 0, f"harmonic_frequency = {self.frequency} Hz must be positive")
 
     def __call__(self, t: Scalar) -> Scalar:
         """Relative change of stiffness at time t [s]."""
-        return self.amplitude * self.envelope(t) * jnp.sin(2 * jnp.pi * self.frequency * t + self.phase)
+        return (
+            self.amplitude
+            * self.envelope(t)
+            * jnp.sin(2 * jnp.pi * self.frequency * t + self.phase)
+        )
 
 
 class SmoothStep(AbstractSignal):
     """A Heaviside step with a finite rise: `initial` before `start`, `level` after `start + rise`.
 
-    Between them `initial + (level - initial) (35 p⁴ - 84 p⁵ + 70 p⁶ - 20 p⁷)`, p = (t - start) / rise: three continuous
-    derivatives, which `PrescribedMotion` needs (its P_w contains x_z''').
+    Between them `initial + (level - initial) (35 p⁴ - 84 p⁵ + 70 p⁶ - 20 p⁷)`, p = (t - start) /
+    rise: three continuous derivatives, which `PrescribedMotion` needs (its P_w contains x_z''').
 
-    **Arguments:** `level`, `start` [s], `rise` [s] > 0, `initial`. **Raises:** `ValueError` if rise <= 0.
+    **Arguments:** `level`, `start` [s], `rise` [s] > 0, `initial`. **Raises:** `ValueError` if rise
+    <= 0.
     """
 
     level: Scalar = 1.0
@@ -87,18 +97,23 @@ class SmoothStep(AbstractSignal):
     def __check_init__(self):
         require(
             self.rise > 0,
-            f"rise = {self.rise} s: a step without rise time has no derivatives; give rise > 0, 0.05 say",
+            f"rise = {self.rise} s: a step without rise time has no derivatives; give rise > 0,"
+            " 0.05 say",
         )
 
     def __call__(self, t: Scalar) -> Scalar:
         p = jnp.clip((t - self.start) / self.rise, 0.0, 1.0)
-        return self.initial + (self.level - self.initial) * p**4 * (35.0 - p * (84.0 - p * (70.0 - 20.0 * p)))
+        return self.initial + (self.level - self.initial) * p**4 * (
+            35.0 - p * (84.0 - p * (70.0 - 20.0 * p))
+        )
 
 
 class RampHold(AbstractSignal):
-    """A linear ramp from `initial` at `start` to `level` at `start + ramp`, then held; its corners are rounded.
+    """A linear ramp from `initial` at `start` to `level` at `start + ramp`, then held; its corners
+    are rounded.
 
-    The slope rises and falls over `corner` seconds by the smooth step above, so that three derivatives are continuous.
+    The slope rises and falls over `corner` seconds by the smooth step above, so that three
+    derivatives are continuous.
 
     **Arguments:** `level`, `start`, `ramp` [s], `corner` [s], 0 < corner <= ramp / 2, `initial`.
     """
@@ -111,22 +126,34 @@ class RampHold(AbstractSignal):
     smoothness: ClassVar[int] = 3
 
     def __check_init__(self):
-        require(self.corner > 0, f"corner = {self.corner} s must be positive: a sharp corner has no second derivative")
-        require(2 * self.corner <= self.ramp, f"corner = {self.corner} s must be at most half the ramp {self.ramp} s")
+        require(
+            self.corner > 0,
+            f"corner = {self.corner} s must be positive: a sharp corner has no second derivative",
+        )
+        require(
+            2 * self.corner <= self.ramp,
+            f"corner = {self.corner} s must be at most half the ramp {self.ramp} s",
+        )
 
     def __call__(self, t: Scalar) -> Scalar:
         def rounded(s):
-            # Integral of the smooth step of degree 5, which has the two derivatives that the slope needs. One
-            # comparison decides between the pieces: two that round differently would lose the slope at the joint.
+            # Integral of the smooth step of degree 5, which has the two derivatives that the slope
+            # needs. One comparison decides between the pieces: two that round differently would
+            # lose the slope at the joint.
             p = jnp.maximum(s / self.corner, 0.0)
-            return jnp.where(p < 1.0, self.corner * p**4 * (2.5 - p * (3.0 - p)), s - 0.5 * self.corner)
+            return jnp.where(
+                p < 1.0, self.corner * p**4 * (2.5 - p * (3.0 - p)), s - 0.5 * self.corner
+            )
 
         begin, end = t - self.start, t - self.start - (self.ramp - self.corner)
-        return self.initial + (self.level - self.initial) * (rounded(begin) - rounded(end)) / (self.ramp - self.corner)
+        return self.initial + (self.level - self.initial) * (rounded(begin) - rounded(end)) / (
+            self.ramp - self.corner
+        )
 
 
 class Decay(AbstractSignal):
-    """`level` until `start`, then an exponential approach to `final` with a flat beginning (one continuous derivative).
+    """`level` until `start`, then an exponential approach to `final` with a flat beginning (one
+    continuous derivative).
 
     `s = final + (level - final) (2 e^-p - e^-2p)`, p = (t - start) / time_constant >= 0.
 
@@ -148,9 +175,11 @@ class Decay(AbstractSignal):
 
 
 class Sampled(AbstractSignal):
-    """`level` times the quintic spline through samples (four continuous derivatives), held beyond its ends.
+    """`level` times the quintic spline through samples (four continuous derivatives), held beyond
+    its ends.
 
-    Build it with `Sampled.through(times, values)`, which makes `breaks` [s] and `coefficients` (pieces, 6) of its pieces.
+    Build it with `Sampled.through(times, values)`, which makes `breaks` [s] and `coefficients`
+    (pieces, 6) of its pieces.
     """
 
     breaks: Float[np.ndarray | Array, " pieces_plus_one"]
@@ -162,25 +191,35 @@ class Sampled(AbstractSignal):
         pieces = len(self.breaks) - 1
         require(
             pieces >= 1 and np.shape(self.coefficients) == (pieces, 6),
-            f"breaks {np.shape(self.breaks)} and coefficients {np.shape(self.coefficients)} do not belong together: a "
-            "spline of n pieces has n + 1 breaks and n rows of 6 coefficients",
+            f"breaks {np.shape(self.breaks)} and coefficients {np.shape(self.coefficients)} do not"
+            " belong together: a spline of n pieces has n + 1 breaks and n rows of 6 coefficients",
         )
         rising = self.breaks[1:] > self.breaks[:-1]
         require(rising, "breaks must increase")
 
     @classmethod
     def through(
-        cls, times: Float[Array | np.ndarray, " samples"], values: Float[Array | np.ndarray, " samples"]
+        cls,
+        times: Float[Array | np.ndarray, " samples"],
+        values: Float[Array | np.ndarray, " samples"],
     ) -> "Sampled":
-        """Spline through `values` at `times` [s], at least six, increasing. Raises `ValueError` otherwise."""
+        """Spline through `values` at `times` [s], at least six, increasing. Raises `ValueError`
+        otherwise."""
         times, values = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
         if times.ndim != 1 or times.shape != values.shape or len(times) < 6:
             raise ValueError(
-                f"times {times.shape} and values {values.shape} must be two equally long lists, 6 samples at least"
+                f"times {times.shape} and values {values.shape} must be two equally long lists, 6"
+                " samples at least"
             )
-        if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values)) and np.all(np.diff(times) > 0)):
+        if not (
+            np.all(np.isfinite(times))
+            and np.all(np.isfinite(values))
+            and np.all(np.diff(times) > 0)
+        ):
             raise ValueError("times must increase and both times and values be finite")
-        pieces = scipy.interpolate.PPoly.from_spline(scipy.interpolate.make_interp_spline(times, values, k=5))
+        pieces = scipy.interpolate.PPoly.from_spline(
+            scipy.interpolate.make_interp_spline(times, values, k=5)
+        )
         keep = np.diff(pieces.x) > 0
         breaks = np.append(pieces.x[:-1][keep], pieces.x[-1])
         return cls(breaks=breaks, coefficients=pieces.c[:, keep].T.copy())
@@ -188,12 +227,15 @@ class Sampled(AbstractSignal):
     def __call__(self, t: Scalar) -> Scalar:
         breaks, coefficients = jnp.asarray(self.breaks), jnp.asarray(self.coefficients)
         t = jnp.clip(t, breaks[0], breaks[-1])
-        piece = jnp.clip(jnp.searchsorted(breaks, jax.lax.stop_gradient(t), side="right") - 1, 0, len(breaks) - 2)
+        piece = jnp.clip(
+            jnp.searchsorted(breaks, jax.lax.stop_gradient(t), side="right") - 1, 0, len(breaks) - 2
+        )
         return self.level * jnp.polyval(coefficients[piece], t - breaks[piece])
 
 
 class Tabulated(AbstractSignal):
-    """A function of time and its first two derivatives at multiples of `interval` [s], looked up: for use in a loop."""
+    """A function of time and its first two derivatives at multiples of `interval` [s], looked up:
+    for use in a loop."""
 
     rows: Float[Array, "3 points"]
     interval: float = eqx.field(static=True)
@@ -203,7 +245,9 @@ class Tabulated(AbstractSignal):
     @classmethod
     def of(cls, signal: Callable[[Scalar], Scalar], interval: float, points: int) -> "Tabulated":
         """A signal or harmonic from t = 0 on."""
-        rows = jax.vmap(lambda t: jnp.stack(derivatives(signal, t, 2)))(jnp.arange(float(points)) * interval)
+        rows = jax.vmap(lambda t: jnp.stack(derivatives(signal, t, 2)))(
+            jnp.arange(float(points)) * interval
+        )
         return cls(rows=rows.T, interval=interval)
 
     def __call__(self, t: Scalar) -> Scalar:
@@ -235,15 +279,24 @@ def as_held(value: "AbstractSignal | Scalar") -> AbstractSignal:
 def as_level(value: Any) -> Any:
     """One number, as it is. Raises `ValueError` for what is none."""
     if isinstance(value, AbstractSignal):
-        raise ValueError(f"x_z = {value}: Isometric holds the insertion, so this is a number; PrescribedLength moves it")
+        raise ValueError(
+            f"x_z = {value}: Isometric holds the insertion, so this is a number; PrescribedLength"
+            " moves it"
+        )
     if isinstance(value, bool | str | bytes | list | tuple | dict | None):
-        raise ValueError(f"an input is {value!r}: give a number or a signal, as jaxmuscle.model.SmoothStep(5.0)")
+        raise ValueError(
+            f"an input is {value!r}: give a number or a signal, as jaxmuscle.model.SmoothStep(5.0)"
+        )
     if callable(value):
-        raise ValueError("an input is a function: give a number or a signal. Of its values at some times jaxmuscle.model."
-                         "Sampled.through(times, values) makes a signal")  # fmt: skip
+        raise ValueError(
+            "an input is a function: give a number or a signal. Of its values at some times"
+            " jaxmuscle.model.Sampled.through(times, values) makes a signal"
+        )
     if np.ndim(value) > 0:
-        raise ValueError(f"an input is an array of shape {np.shape(value)}: give a number or a signal. Of values at some "
-                         "times jaxmuscle.model.Sampled.through(times, values) makes a signal")  # fmt: skip
+        raise ValueError(
+            f"an input is an array of shape {np.shape(value)}: give a number or a signal. Of values"
+            " at some times jaxmuscle.model.Sampled.through(times, values) makes a signal"
+        )
     return value
 
 

@@ -1,4 +1,5 @@
-"""What every task has: muscle, perturbation, parameters by name, and what a task shows of itself."""
+"""What every task has: muscle, perturbation, parameters by name, and what a task shows of
+itself."""
 
 import abc
 import dataclasses
@@ -63,24 +64,30 @@ def proper_part(name: str, value: Any) -> Any:
 class AbstractTask(Shown, eqx.Module):
     """What is simulated: `y' = vector_field(t, y, u)`, observed as `output(t, y, u, u')`.
 
-    `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z, ΔP_w / P_w)` [N/m, N s/m, 1] is the perturbation of coefficients and drive: noise and
-    harmonic, those of K_w, C_w and P_w through the `activation` if there is one. Common to all tasks are the `muscle`, the
-    `noise`, the `harmonic`, the `activation`, how the output's spectrum is estimated (`settings`) and the initial state
-    (`initial`). As an argument None stands for the default muscle, noise, harmonic and settings, for no activation, and for
-    an initial state of zero.
+    `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z, ΔP_w / P_w)` [N/m, N s/m, 1] is the perturbation of coefficients
+    and drive: noise and harmonic, those of K_w, C_w and P_w through the `activation` if there is
+    one. Common to all tasks are the `muscle`, the `noise`, the `harmonic`, the `activation`, how
+    the output's spectrum is estimated (`settings`) and the initial state (`initial`). As an
+    argument None stands for the default muscle, noise, harmonic and settings, for no activation,
+    and for an initial state of zero.
 
-    `task[name]` and `task.name` read a parameter by its name in the parameter table, `task.replace(name=value)` changes it;
-    the tasks of the package take it as an argument, too, and a noise by its name: `Isometric(k_w=4e5, noise="pink")`. A name
-    that is a field of the task (`P_w`, the signal) stays the field: `task["P_w"]` is its level. Printed, a task is a table.
+    `task[name]` and `task.name` read a parameter by its name in the parameter table,
+    `task.replace(name=value)` changes it; the tasks of the package take it as an argument, too, and
+    a noise by its name: `Isometric(k_w=4e5, noise="pink")`. A name that is a field of the task
+    (`P_w`, the signal) stays the field: `task["P_w"]` is its level. Printed, a task is a table.
     """
 
     muscle: AbstractMuscle = eqx.field(default_factory=Muscle, kw_only=True)
     noise: AbstractNoise = eqx.field(
-        default_factory=BandLimitedNoise, kw_only=True, converter=lambda noise: proper_part("noise", noise).per_channel()
+        default_factory=BandLimitedNoise,
+        kw_only=True,
+        converter=lambda noise: proper_part("noise", noise).per_channel(),
     )
     harmonic: Harmonic = eqx.field(default_factory=Harmonic, kw_only=True)
     activation: Activation | None = eqx.field(default=None, kw_only=True)
-    settings: SpectrumSettings = eqx.field(static=True, default_factory=SpectrumSettings, kw_only=True)
+    settings: SpectrumSettings = eqx.field(
+        static=True, default_factory=SpectrumSettings, kw_only=True
+    )
     initial: tuple[Scalar, ...] | None = eqx.field(default=None, kw_only=True)
 
     state_names: ClassVar[tuple[str, ...]]
@@ -91,8 +98,10 @@ class AbstractTask(Shown, eqx.Module):
 
     def __check_init__(self):
         if missing := [name for name in SAID if not hasattr(type(self), name)]:
-            raise ValueError(f"{type(self).__name__} does not say its {', '.join(missing)}: a task of your own needs "
-                             f"{', '.join(SAID)} as class variables, as jaxmuscle.Isometric has them")  # fmt: skip
+            raise ValueError(
+                f"{type(self).__name__} does not say its {', '.join(missing)}: a task of your own"
+                f" needs {', '.join(SAID)} as class variables, as jaxmuscle.Isometric has them"
+            )
 
     @abc.abstractmethod
     def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
@@ -106,7 +115,8 @@ class AbstractTask(Shown, eqx.Module):
         return get_parameter(self, name)
 
     def __getattr__(self, name: str) -> Scalar:
-        """A parameter by its name. Raises `AttributeError` for what is neither a parameter nor anything else."""
+        """A parameter by its name. Raises `AttributeError` for what is neither a parameter nor
+        anything else."""
         if name[:1] == "_" or name in {field.name for field in dataclasses.fields(self)}:
             raise AttributeError(f"{type(self).__name__} has no {name}", name=name, obj=self)
         try:
@@ -118,15 +128,17 @@ class AbstractTask(Shown, eqx.Module):
         return [*object.__dir__(self), *self.parameter_names, *BASE]
 
     def replace(self: Task, **values: Scalar) -> Task:
-        """A copy with the named parameters set. Raises `ValueError` for an unknown name or an impossible value.
+        """A copy with the named parameters set. Raises `ValueError` for an unknown name or an
+        impossible value.
 
         task = jm.Isometric().replace(k_w=4e5, noise_K_w=0.1)
         """
         return set_parameters(self, values)
 
     def with_parts(self: Task, **parts: Any) -> Task:
-        """A copy with whole parts exchanged: fields of the task, as `muscle`, `noise`, `harmonic`, `settings`, and inputs
-        over time, as `P_w`. The tasks of the package take parameters here, too, as `k_w=4e5`.
+        """A copy with whole parts exchanged: fields of the task, as `muscle`, `noise`, `harmonic`,
+        `settings`, and inputs over time, as `P_w`. The tasks of the package take parameters here,
+        too, as `k_w=4e5`.
 
             task = jm.Isometric().with_parts(noise=jm.PinkNoise())
 
@@ -136,7 +148,8 @@ class AbstractTask(Shown, eqx.Module):
         return type(self)(**(fields | parts))
 
     def as_task(self, task: type[Task], **inputs: Any) -> Task:
-        """The same muscle, perturbation and settings in another task, with that task's default inputs unless given.
+        """The same muscle, perturbation and settings in another task, with that task's default
+        inputs unless given.
 
         moving = jm.Isometric().as_task(jm.PrescribedForce, P_w=4.0)
         """
@@ -145,27 +158,36 @@ class AbstractTask(Shown, eqx.Module):
     @property
     def common(self) -> dict[str, Any]:
         """What all tasks have: muscle, noise, harmonic, activation and spectrum settings."""
-        return {n: getattr(self, n) for n in ("muscle", "noise", "harmonic", "activation", "settings")}
+        return {
+            n: getattr(self, n) for n in ("muscle", "noise", "harmonic", "activation", "settings")
+        }
 
     @property
     def quantity(self) -> str:
-        """What the output is, by its unit: "force", "displacement" or "acceleration", as a `Target` calls it."""
+        """What the output is, by its unit: "force", "displacement" or "acceleration", as a `Target`
+        calls it."""
         return {"m": "displacement", "m/s^2": "acceleration"}.get(self.output_unit, "force")
 
     def with_input(self, name: str) -> "AbstractTask":
         """A copy that has the parameter `name`, of those that a task may lack.
 
-        "activation_time" adds an activation with its default contraction time; "noise_P_w" adds the drive's channel to the
-        noise, with the amplitude 0, which `replace` changes.
+        "activation_time" adds an activation with its default contraction time; "noise_P_w" adds the
+        drive's channel to the noise, with the amplitude 0, which `replace` changes.
         """
         if name == "activation_time":
             return self.with_parts(activation=Activation())
         parts = list(self.noise.components)
-        which = next((i for i, part in enumerate(parts) if not isinstance(part, ResonantNoise)), None)
+        which = next(
+            (i for i, part in enumerate(parts) if not isinstance(part, ResonantNoise)), None
+        )
         if which is None or len(parts[which].acts_on) != len(CHANNELS):
             return self
         amplitude = parts[which].amplitude
-        wider = jnp.append(amplitude, 0.0) if isinstance(amplitude, jax.Array) else np.append(np.asarray(amplitude), 0.0)
+        wider = (
+            jnp.append(amplitude, 0.0)
+            if isinstance(amplitude, jax.Array)
+            else np.append(np.asarray(amplitude), 0.0)
+        )
         parts[which] = eqx.tree_at(lambda n: n.amplitude, parts[which], wider)
         return self.with_parts(noise=NoiseSum(tuple(parts)) if len(parts) > 1 else parts[0])
 
@@ -188,29 +210,44 @@ class AbstractTask(Shown, eqx.Module):
     def initial_state(self) -> State:
         """State at t = 0."""
         size = len(self.state_names)
-        return jnp.zeros(size) if self.initial is None else jnp.stack([jnp.asarray(v) * 1.0 for v in self.initial])
+        return (
+            jnp.zeros(size)
+            if self.initial is None
+            else jnp.stack([jnp.asarray(v) * 1.0 for v in self.initial])
+        )
 
     def noise_scale(self, noise: AbstractNoise | None = None) -> Float[Array, " inputs"]:
-        """Amplitudes of the noise, or of `noise`, one of its components: for each entry of u that it acts on, in its unit.
+        """Amplitudes of the noise, or of `noise`, one of its components: for each entry of u that
+        it acts on, in its unit.
 
-        Relative amplitudes are multiplied by K_w0, K_z0, C_w0 and C_z0; that of the drive stays a fraction.
+        Relative amplitudes are multiplied by K_w0, K_z0, C_w0 and C_z0; that of the drive stays a
+        fraction.
         """
         noise = self.noise if noise is None else noise
         amplitude = jnp.asarray(noise.amplitude)
         if not noise.relative or len(noise.acts_on) == 1:
             return amplitude
         base = self.muscle.base()
-        return amplitude * (base if len(noise.acts_on) == len(base) else jnp.append(base, jnp.ones((), base.dtype)))
+        return amplitude * (
+            base if len(noise.acts_on) == len(base) else jnp.append(base, jnp.ones((), base.dtype))
+        )
 
     def _card(self) -> Card:
         parts = isinstance(self.noise, AbstractNoise) and isinstance(self.muscle, AbstractMuscle)
         if not parts or isinstance(self.noise.amplitude, tuple):
             return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
-        free, noises = usually_free(self), " + ".join(type(part).__name__ for part in self.noise.components)
+        free, noises = (
+            usually_free(self),
+            " + ".join(type(part).__name__ for part in self.noise.components),
+        )
         facts = [f"noise     {noises}", f"spectrum  {self.settings.name or 'settings of its own'}"]
-        facts += [] if isinstance(self.muscle, Muscle) else [f"muscle    {type(self.muscle).__name__}"]
+        facts += (
+            [] if isinstance(self.muscle, Muscle) else [f"muscle    {type(self.muscle).__name__}"]
+        )
         facts += [f"{name:<8}  {type(value).__name__}" for name, value in self._inputs().items()]
-        rows = tuple(_shown_row(self, name, path, name in free) for name, path in paths_of(self).items())
+        rows = tuple(
+            _shown_row(self, name, path, name in free) for name, path in paths_of(self).items()
+        )
         heading = f"{type(self).__name__}, which gives {self.output_name} [{self.output_unit}]"
         text = "\n".join([heading, *(f"  {fact}" for fact in facts), *in_columns(COLUMNS, rows)])
         return Card(text, heading, COLUMNS, rows, tuple(" ".join(fact.split()) for fact in facts))
@@ -232,7 +269,13 @@ COLUMNS = ("name", "value", "unit", "fit", "what it is")
 def _shown_row(task: AbstractTask, name: str, path: tuple, free: bool) -> tuple[str, ...]:
     row = PARAMETERS.get(name)
     unit, meaning = ("", "") if row is None else ("" if row.unit == "1" else row.unit, row.meaning)
-    return name, in_numbers(value_of(task, path)), unit, "free" if free else "fixed", meaning.partition(";")[0]
+    return (
+        name,
+        in_numbers(value_of(task, path)),
+        unit,
+        "free" if free else "fixed",
+        meaning.partition(";")[0],
+    )
 
 
 def in_numbers(value: Any) -> str:
@@ -247,8 +290,14 @@ def in_numbers(value: Any) -> str:
 
 
 def fill(task: AbstractTask, fields: Mapping[str, Any], parameters: Mapping[str, Any]) -> None:
-    """Set the fields of a task that is being made, None to its default, a noise by its name; then parameters by theirs."""
-    empty = {"muscle": Muscle, "noise": BandLimitedNoise, "harmonic": Harmonic, "settings": SpectrumSettings}
+    """Set the fields of a task that is being made, None to its default, a noise by its name; then
+    parameters by theirs."""
+    empty = {
+        "muscle": Muscle,
+        "noise": BandLimitedNoise,
+        "harmonic": Harmonic,
+        "settings": SpectrumSettings,
+    }
     for field in dataclasses.fields(task):
         value = fields[field.name]
         if value is None and field.name in empty:
@@ -262,20 +311,25 @@ def fill(task: AbstractTask, fields: Mapping[str, Any], parameters: Mapping[str,
     if parameters:
         made = assigned(task, dict(parameters))
         for field in dataclasses.fields(task):
-            part = getattr(made, field.name)  # its numbers are others than those that it was made with
-            object.__setattr__(task, field.name, checked(part) if isinstance(part, eqx.Module) else part)
+            # its numbers are others than those that it was made with
+            part = getattr(made, field.name)
+            object.__setattr__(
+                task, field.name, checked(part) if isinstance(part, eqx.Module) else part
+            )
 
 
 def require_task(task: Any, example: str) -> None:
     """Raise a `ValueError` for what is no task, where one is needed."""
     require(
         isinstance(task, AbstractTask),
-        f"task: this is of type {type(task).__name__}; give a task first, as jaxmuscle.Isometric(): {example}",
+        f"task: this is of type {type(task).__name__}; give a task first, as jaxmuscle.Isometric():"
+        f" {example}",
     )
     if is_batched(task):
         raise ValueError(
-            "task: these are several tasks in one, as jax.vmap makes them: each number has an axis in front. Give one task: "
-            "inside jax.vmap it is one. For simulations of several, give jaxmuscle.ensemble a jaxmuscle.Sweep"
+            "task: these are several tasks in one, as jax.vmap makes them: each number has an axis"
+            " in front. Give one task: inside jax.vmap it is one. For simulations of several, give"
+            " jaxmuscle.ensemble a jaxmuscle.Sweep"
         )
 
 
@@ -290,7 +344,10 @@ SAID = ("state_names", "state_units", "output_name", "output_unit", "smoothness_
 
 def check_task(task: AbstractTask) -> None:
     if task.initial is not None and len(task.initial) != len(task.state_names):
-        raise ValueError(f"initial has {len(task.initial)} entries, {type(task).__name__} needs {task.state_names}")
+        raise ValueError(
+            f"initial has {len(task.initial)} entries, {type(task).__name__} needs"
+            f" {task.state_names}"
+        )
     for field in dataclasses.fields(task):
         value = getattr(task, field.name)
         level = getattr(value, "level", value)  # of an input that is a signal
@@ -303,9 +360,12 @@ def check_task(task: AbstractTask) -> None:
 
 
 def _check_noise(task: AbstractTask) -> None:
-    """Refuse noise rougher than the task can sample or differentiate, where its amplitude is not zero."""
-    what = {1: f"appears directly in the output {task.output_name}, where white noise has no value",
-            2: "must be differentiable in time"}  # fmt: skip
+    """Refuse noise rougher than the task can sample or differentiate, where its amplitude is not
+    zero."""
+    what = {
+        1: f"appears directly in the output {task.output_name}, where white noise has no value",
+        2: "must be differentiable in time",
+    }
     needed = (*task.smoothness_needed, 0)
     for noise in task.noise.components:
         if not is_concrete(noise.amplitude):
@@ -314,19 +374,24 @@ def _check_noise(task: AbstractTask) -> None:
             have = noise.smoothness + 2 * (task.activation is not None and i in ACTIVE)
             if have < needed[i] and amplitude != 0:
                 raise ValueError(
-                    f"{type(noise).__name__} on {INPUTS[i]} cannot be used in {type(task).__name__}: there it "
-                    f"{what[needed[i]]}. Use BandLimitedNoise, or set noise_{INPUTS[i]} = 0"
+                    f"{type(noise).__name__} on {INPUTS[i]} cannot be used in"
+                    f" {type(task).__name__}: there it {what[needed[i]]}. Use BandLimitedNoise, or"
+                    f" set noise_{INPUTS[i]} = 0"
                 )
 
 
 def check_smooth(task: AbstractTask, name: str, need: int) -> None:
     signal = getattr(task, name)
     if signal.smoothness < need:
-        raise ValueError(f"{name} is a {type(signal).__name__} with {signal.smoothness} continuous derivatives; "
-                         f"{type(task).__name__} needs {need}: use SmoothStep, RampHold or Sampled")  # fmt: skip
+        raise ValueError(
+            f"{name} is a {type(signal).__name__} with {signal.smoothness} continuous derivatives; "
+            f"{type(task).__name__} needs {need}: use SmoothStep, RampHold or Sampled"
+        )
 
 
 def check_smooth_envelope(task: AbstractTask) -> None:
     envelope = task.harmonic.envelope
     if envelope.smoothness < 1:
-        raise ValueError(f"harmonic envelope {type(envelope).__name__} must have a continuous derivative")
+        raise ValueError(
+            f"harmonic envelope {type(envelope).__name__} must have a continuous derivative"
+        )

@@ -1,4 +1,5 @@
-"""Tasks as tables: one holds the muscle, its perturbation, the inputs and the spectrum settings, every number of them."""
+"""Tasks as tables: one holds the muscle, its perturbation, the inputs and the spectrum settings,
+every number of them."""
 
 import dataclasses
 from types import NoneType, UnionType
@@ -13,26 +14,56 @@ from jaxmuscle._common.errors import PresetError
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from . import _activation, _muscle, _noise, _pink_noise, _resonant_noise, _signals, _tasks, _white_noise
+from . import (
+    _activation,
+    _muscle,
+    _noise,
+    _pink_noise,
+    _resonant_noise,
+    _signals,
+    _tasks,
+    _white_noise,
+)
 from ._tasks import TASKS, AbstractTask
 
 ABSENT = "none"  # what stands for a part that a task does not have: TOML has no null
 LARGEST = 1e50  # of any number, whatever its unit: what is larger overflows in the equations
 
-_BASES = (_muscle.AbstractMuscle, _muscle.AbstractLaw, _noise.AbstractNoise, _signals.AbstractSignal)
+_BASES = (
+    _muscle.AbstractMuscle,
+    _muscle.AbstractLaw,
+    _noise.AbstractNoise,
+    _signals.AbstractSignal,
+)
 _PARTS = (*_BASES, _activation.Activation, _signals.Harmonic, AbstractTask)
 _KINDS: dict[str, type] = {
     kind.__name__: kind
-    for module in (_activation, _muscle, _noise, _pink_noise, _resonant_noise, _signals, _tasks, _white_noise)
+    for module in (
+        _activation,
+        _muscle,
+        _noise,
+        _pink_noise,
+        _resonant_noise,
+        _signals,
+        _tasks,
+        _white_noise,
+    )
     for kind in vars(module).values()
-    if isinstance(kind, type) and issubclass(kind, _PARTS) and not kind.__name__.startswith("Abstract")
+    if isinstance(kind, type)
+    and issubclass(kind, _PARTS)
+    and not kind.__name__.startswith("Abstract")
 }
 _NAMES = {kind: name for name, kind in TASKS.items()}
 
 
 def task_to_table(task: AbstractTask) -> dict[str, Any]:
-    """A task as nested tables of numbers and strings. Raises `PresetError` for a class that is not jaxmuscle's."""
-    return {"task": _NAMES[type(task)]} | _fields_to_table(as_numbers(task)) if type(task) in _NAMES else _refuse(task)
+    """A task as nested tables of numbers and strings. Raises `PresetError` for a class that is not
+    jaxmuscle's."""
+    return (
+        {"task": _NAMES[type(task)]} | _fields_to_table(as_numbers(task))
+        if type(task) in _NAMES
+        else _refuse(task)
+    )
 
 
 def _known() -> dict[str, type]:
@@ -46,12 +77,15 @@ def _below(kind: type) -> list[type]:
 
 def _refuse(value: Any) -> dict[str, Any]:
     raise PresetError(
-        f"{type(value).__name__} is not one of jaxmuscle's own classes and cannot be saved: keep the code that makes it"
+        f"{type(value).__name__} is not one of jaxmuscle's own classes and cannot be saved: keep"
+        " the code that makes it"
     )
 
 
 def _fields_to_table(module: eqx.Module) -> dict[str, Any]:
-    return {field.name: _to_table(getattr(module, field.name)) for field in dataclasses.fields(module)}
+    return {
+        field.name: _to_table(getattr(module, field.name)) for field in dataclasses.fields(module)
+    }
 
 
 def _to_table(value: Any) -> Any:
@@ -69,7 +103,8 @@ def _to_table(value: Any) -> Any:
 
 
 def task_from_table(table: dict[str, Any], *, whole: bool = True) -> AbstractTask:
-    """The task of a table. Raises `PresetError` naming the key that is missing, unknown or wrong: nothing gets a default.
+    """The task of a table. Raises `PresetError` naming the key that is missing, unknown or wrong:
+    nothing gets a default.
 
     Without `whole` what a task does not have may be left out, as the first format did.
     """
@@ -87,14 +122,24 @@ def _build(kind: type, table: dict[str, Any], where: str, whole: bool) -> Any:
             raise PresetError(f"unknown key {where}.{key}: {choices(key, fields)}")
     absent: dict[str, Any] = {}
     if not whole:  # parts that a task need not have, and choices that are younger than the format
-        absent = {name: ABSENT for name, field in fields.items() if NoneType in get_args(field.type)}
-        absent |= {name: field.default for name, field in fields.items() if isinstance(field.default, str)}
+        absent = {
+            name: ABSENT for name, field in fields.items() if NoneType in get_args(field.type)
+        }
+        absent |= {
+            name: field.default for name, field in fields.items() if isinstance(field.default, str)
+        }
     values = {}
     for name, field in fields.items():
         if name not in table and name not in absent:
-            raise PresetError(f"{where} has no key {name!r}: give it; a number that is not there gets no default")
+            raise PresetError(
+                f"{where} has no key {name!r}: give it; a number that is not there gets no default"
+            )
         values[name] = _value(kind, field, (absent | table)[name], f"{where}.{name}", whole)
-    if kind in (_white_noise.OrnsteinUhlenbeckNoise, _resonant_noise.ResonantNoise, _pink_noise.PinkNoise):
+    if kind in (
+        _white_noise.OrnsteinUhlenbeckNoise,
+        _resonant_noise.ResonantNoise,
+        _pink_noise.PinkNoise,
+    ):
         values["std"] = values.pop("amplitude")
     try:
         return kind(**values)
@@ -104,7 +149,9 @@ def _build(kind: type, table: dict[str, Any], where: str, whole: bool) -> Any:
 
 def _value(kind: type, field: Any, value: Any, where: str, whole: bool) -> Any:
     """That of a field: a part, several, numbers, a switch or a word, as the class declares it."""
-    options = get_args(field.type) if get_origin(field.type) in (Union, UnionType) else (field.type,)
+    options = (
+        get_args(field.type) if get_origin(field.type) in (Union, UnionType) else (field.type,)
+    )
     if NoneType in options and value == ABSENT:
         return None
     meant = options[0]
@@ -112,16 +159,33 @@ def _value(kind: type, field: Any, value: Any, where: str, whole: bool) -> Any:
         return _settings(converted(value, dict, where, PresetError), where, whole)
     if get_origin(meant) is tuple:
         inner = get_args(meant)[0]
-        entries = [(each, f"{where}[{i}]") for i, each in enumerate(converted(value, list, where, PresetError))]
-        return tuple(_part(inner, each, at, whole) if _is_part(inner) else _number(each, at) for each, at in entries)
+        entries = [
+            (each, f"{where}[{i}]")
+            for i, each in enumerate(converted(value, list, where, PresetError))
+        ]
+        return tuple(
+            _part(inner, each, at, whole) if _is_part(inner) else _number(each, at)
+            for each, at in entries
+        )
     if _is_part(meant):
         # A number stands for a step with default times, so no file of today may hold one.
-        number = not whole and issubclass(meant, _signals.AbstractSignal) and field.metadata.get("converter") is not None
-        return _number(value, where) if number and not isinstance(value, dict) else _part(meant, value, where, whole)
-    several = "converter" in field.metadata or kind not in _KINDS.values()  # one for each input, or what a user's class has
+        number = (
+            not whole
+            and issubclass(meant, _signals.AbstractSignal)
+            and field.metadata.get("converter") is not None
+        )
+        return (
+            _number(value, where)
+            if number and not isinstance(value, dict)
+            else _part(meant, value, where, whole)
+        )
+    # one for each input, or what a user's class has
+    several = "converter" in field.metadata or kind not in _KINDS.values()
     if hasattr(meant, "dims") and (float not in options or (several and isinstance(value, list))):
         return _numbers(meant, value, where)
-    return _number(value, where) if float in options else converted(value, meant, where, PresetError)
+    return (
+        _number(value, where) if float in options else converted(value, meant, where, PresetError)
+    )
 
 
 def _settings(table: dict[str, Any], where: str, whole: bool) -> SpectrumSettings:
@@ -140,17 +204,23 @@ def _part(kind: type, value: Any, where: str, whole: bool) -> Any:
     name, known = table.get("type"), _known()
     if not isinstance(name, str) or name not in known:
         raise PresetError(
-            f"{where}.type = {name!r}: {choices(str(name), known)}; a class of your own must be imported first"
+            f"{where}.type = {name!r}: {choices(str(name), known)}; a class of your own must be"
+            " imported first"
         )
     if not issubclass(known[name], kind):
-        raise PresetError(f"{where}.type = {name!r} is of the wrong kind: give {kind.__name__.removeprefix('Abstract')}")
+        raise PresetError(
+            f"{where}.type = {name!r} is of the wrong kind: give"
+            f" {kind.__name__.removeprefix('Abstract')}"
+        )
     return _build(known[name], {k: v for k, v in table.items() if k != "type"}, where, whole)
 
 
 def _number(value: Any, where: str) -> float:
     number = converted(value, float, where, PresetError)
     if abs(number) > LARGEST:
-        raise PresetError(f"{where} = {number:g} is out of range: numbers are below {LARGEST:g}, in SI units")
+        raise PresetError(
+            f"{where} = {number:g} is out of range: numbers are below {LARGEST:g}, in SI units"
+        )
     return number
 
 
@@ -165,5 +235,7 @@ def _numbers(kind: Any, value: Any, where: str) -> np.ndarray:
     if kind.index_variadic is None and array.ndim != len(kind.dims):
         raise PresetError(f"{where} has {array.ndim} dimensions, {len(kind.dims)} belong there")
     if not np.all(np.abs(array) <= LARGEST):
-        raise PresetError(f"{where} holds a number out of range: numbers are below {LARGEST:g}, in SI units")
+        raise PresetError(
+            f"{where} holds a number out of range: numbers are below {LARGEST:g}, in SI units"
+        )
     return array

@@ -24,17 +24,20 @@ Observed = Literal["displacement", "acceleration"]
 class PrescribedMotion(AbstractTask):
     """Task 1: the insertion moves as prescribed, which internal force P_w does that need?
 
-    State x_w. Equation (1b) gives `x_w' = v` such that `passive_force(x_w, v, x_z, x_z', u) = -(F_ext + m_z x_z'')`, for
-    the paper's muscle `x_w' = x_z' + (F_ext + m_z x_z'' + K_z (x_z - x_w)) / C_z`, and (1a) the output
+    State x_w. Equation (1b) gives `x_w' = v` such that `passive_force(x_w, v, x_z, x_z', u) =
+    -(F_ext + m_z x_z'')`, for the paper's muscle `x_w' = x_z' + (F_ext + m_z x_z'' + K_z (x_z -
+    x_w)) / C_z`, and (1a) the output
 
         P_w = m_w x_w'' + active_force(x_w, x_w', u) + m_z x_z'' + F_ext
 
     where x_w'' is the total time derivative of the right-hand side along (1, x_w', u').
 
-    **Arguments:** `x_z` [m] and `F_ext` [N], numbers (smooth steps from zero) or signals; the common fields.
+    **Arguments:** `x_z` [m] and `F_ext` [N], numbers (smooth steps from zero) or signals; the
+    common fields.
 
-    **Raises:** `ValueError` if C_z0 = 0 (x_w' would be infinite at rest), if noise on K_z or C_z is not differentiable,
-    for white noise anywhere (P_w contains it), for inputs that are not smooth enough.
+    **Raises:** `ValueError` if C_z0 = 0 (x_w' would be infinite at rest), if noise on K_z or C_z is
+    not differentiable, for white noise anywhere (P_w contains it), for inputs that are not smooth
+    enough.
     """
 
     x_z: AbstractSignal = eqx.field(converter=as_signal, default=default("x_z"))
@@ -58,8 +61,16 @@ class PrescribedMotion(AbstractTask):
         initial: "tuple[Scalar, ...] | None" = None,
         **parameters: "Scalar",
     ):
-        fields = dict(x_z=x_z, F_ext=F_ext, muscle=muscle, noise=noise, harmonic=harmonic, activation=activation,
-                      settings=settings, initial=initial)  # fmt: skip
+        fields = dict(
+            x_z=x_z,
+            F_ext=F_ext,
+            muscle=muscle,
+            noise=noise,
+            harmonic=harmonic,
+            activation=activation,
+            settings=settings,
+            initial=initial,
+        )
         fill(self, fields, parameters)
 
     def __check_init__(self):
@@ -67,11 +78,16 @@ class PrescribedMotion(AbstractTask):
         check_smooth(self, "x_z", 3)
         check_smooth(self, "F_ext", 1)
         check_smooth_envelope(self)
-        require(type(self.muscle).contraction_velocity is not AbstractMuscle.contraction_velocity,
-                f"{type(self.muscle).__name__} has no method contraction_velocity, which PrescribedMotion needs: write it "
-                "(see docs/own-muscle.md), or use another task")  # fmt: skip
-        require(self.muscle.base()[3] > 0, "C_z0 = c_z v_ref_z^2 = 0: in PrescribedMotion x_w' divides by C_z, which "
-                "would vanish whenever the insertion rests; give c_z > 0 and v_ref_z > 0")  # fmt: skip
+        require(
+            type(self.muscle).contraction_velocity is not AbstractMuscle.contraction_velocity,
+            f"{type(self.muscle).__name__} has no method contraction_velocity, which"
+            " PrescribedMotion needs: write it (see docs/own-muscle.md), or use another task",
+        )
+        require(
+            self.muscle.base()[3] > 0,
+            "C_z0 = c_z v_ref_z^2 = 0: in PrescribedMotion x_w' divides by C_z, which "
+            "would vanish whenever the insertion rests; give c_z > 0 and v_ref_z > 0",
+        )
 
     def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
         x_z, v_z, a_z = derivatives(self.x_z, t, 2)
@@ -90,17 +106,18 @@ class PrescribedMotion(AbstractTask):
 class PrescribedForce(AbstractTask):
     """Task 2: the muscle pulls with a prescribed force P_w, how does the insertion move?
 
-    State (x_w, x_w', x_z, x_z'), equations (1a) and (1b). Output: x_z [m]; or with `observe="acceleration"`, what an
-    accelerometer on the insertion reads but for gravity,
+    State (x_w, x_w', x_z, x_z'), equations (1a) and (1b). Output: x_z [m]; or with
+    `observe="acceleration"`, what an accelerometer on the insertion reads but for gravity,
 
         x_z'' = -(F_ext + passive_force(x_w, x_w', x_z, x_z', u)) / m_z    [m/s^2]
 
     Its mean is zero. So it has no coefficient of variation.
 
-    **Arguments:** `P_w` and `F_ext` [N], numbers (smooth steps from zero) or signals; `observe`, "displacement" or
-    "acceleration"; the common fields.
+    **Arguments:** `P_w` and `F_ext` [N], numbers (smooth steps from zero) or signals; `observe`,
+    "displacement" or "acceleration"; the common fields.
 
-    **Raises:** `ValueError` for another `observe`, and for white noise on K_z or C_z, which x_z'' contains directly.
+    **Raises:** `ValueError` for another `observe`, and for white noise on K_z or C_z, which x_z''
+    contains directly.
     """
 
     P_w: AbstractSignal = eqx.field(converter=as_signal, default=default("P_w"))
@@ -123,13 +140,24 @@ class PrescribedForce(AbstractTask):
         initial: "tuple[Scalar, ...] | None" = None,
         **parameters: "Scalar",
     ):
-        fields = dict(P_w=P_w, F_ext=F_ext, observe=observe, muscle=muscle, noise=noise, harmonic=harmonic,
-                      activation=activation, settings=settings, initial=initial)  # fmt: skip
+        fields = dict(
+            P_w=P_w,
+            F_ext=F_ext,
+            observe=observe,
+            muscle=muscle,
+            noise=noise,
+            harmonic=harmonic,
+            activation=activation,
+            settings=settings,
+            initial=initial,
+        )
         fill(self, fields, parameters)
 
     def __check_init__(self):
         if self.observe not in get_args(Observed):
-            raise ValueError(f"observe = {self.observe!r}: {choices(str(self.observe), get_args(Observed))}")
+            raise ValueError(
+                f"observe = {self.observe!r}: {choices(str(self.observe), get_args(Observed))}"
+            )
         check_task(self)
 
     @property
@@ -154,7 +182,9 @@ class PrescribedForce(AbstractTask):
         x_w, v_w, x_z, v_z = y[0], y[1], y[2], y[3]
         muscle = self.muscle
         passive = muscle.passive_force(x_w, v_w, x_z, v_z, u)
-        a_w = (muscle.drive(self.P_w(t), u) - muscle.active_force(x_w, v_w, u) + passive) / muscle.m_w
+        a_w = (
+            muscle.drive(self.P_w(t), u) - muscle.active_force(x_w, v_w, u) + passive
+        ) / muscle.m_w
         return jnp.stack([v_w, a_w, v_z, -(self.F_ext(t) + passive) / muscle.m_z])
 
     def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
@@ -162,24 +192,27 @@ class PrescribedForce(AbstractTask):
 
 
 class PrescribedLength(AbstractTask):
-    """The perturbation experiment: a motor moves the insertion as prescribed, a sensor there reads F_ext.
+    """The perturbation experiment: a motor moves the insertion as prescribed, a sensor there reads
+    F_ext.
 
     State (x_w, x_w'), equation (1a) with x_z(t) given; output, by (1b),
 
         F_ext = -(passive_force(x_w, x_w', x_z, x_z', u) + m_z x_z'')
 
-    x_z counts in the direction of the muscle's pull: where it rises, the muscle shortens. `dynamic_stiffness` is the
-    linear response of -F_ext to it.
+    x_z counts in the direction of the muscle's pull: where it rises, the muscle shortens.
+    `dynamic_stiffness` is the linear response of -F_ext to it.
 
     **Arguments:**
 
     - `P_w` [N]: a number (a smooth step from zero) or a signal, as `jaxmuscle.model.RampHold(5.0)`
-    - `x_z` [m]: a number (held from the start) or a signal with two continuous derivatives; samples over time become one by
-      `jaxmuscle.model.Sampled.through(times, values)`
-    - `muscle`, `noise`, `harmonic`, `activation`, `settings`, `initial`: the fields that all tasks have
+    - `x_z` [m]: a number (held from the start) or a signal with two continuous derivatives; samples
+      over time become one by `jaxmuscle.model.Sampled.through(times, values)`
+    - `muscle`, `noise`, `harmonic`, `activation`, `settings`, `initial`: the fields that all tasks
+      have
     - any other name: a parameter of the table `jaxmuscle.PARAMETERS`, as `k_w=4e5`
 
-    **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly, and for an x_z that is not smooth.
+    **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly, and for
+    an x_z that is not smooth.
     """
 
     P_w: AbstractSignal = eqx.field(converter=as_signal, default=default("P_w"))
@@ -203,8 +236,16 @@ class PrescribedLength(AbstractTask):
         initial: "tuple[Scalar, ...] | None" = None,
         **parameters: "Scalar",
     ):
-        fields = dict(P_w=P_w, x_z=x_z, muscle=muscle, noise=noise, harmonic=harmonic, activation=activation,
-                      settings=settings, initial=initial)  # fmt: skip
+        fields = dict(
+            P_w=P_w,
+            x_z=x_z,
+            muscle=muscle,
+            noise=noise,
+            harmonic=harmonic,
+            activation=activation,
+            settings=settings,
+            initial=initial,
+        )
         fill(self, fields, parameters)
 
     def __check_init__(self):
@@ -216,7 +257,9 @@ class PrescribedLength(AbstractTask):
         """Where the insertion is at time t [s], its velocity and its acceleration."""
         return derivatives(self.x_z, t, 2)  # pyright: ignore[reportReturnType]
 
-    def moved(self, t: Scalar, y: State, u: Perturbation, insertion: tuple[Scalar, Scalar, Scalar]) -> tuple[State, Scalar]:
+    def moved(
+        self, t: Scalar, y: State, u: Perturbation, insertion: tuple[Scalar, Scalar, Scalar]
+    ) -> tuple[State, Scalar]:
         """Time derivative of the state, and F_ext, with the insertion there."""
         x_z, v_z, a_z = insertion
         passive = self.muscle.passive_force(y[0], y[1], x_z, v_z, u)
@@ -234,13 +277,15 @@ class PrescribedLength(AbstractTask):
 class Isometric(PrescribedLength):
     """The experiments of [30] and [12]: the insertion is held at x_z, a sensor there reads F_ext.
 
-    `PrescribedLength` with an insertion at rest: output `F_ext = C_z x_w' + K_z (x_w - x_z)`, the negative passive force.
+    `PrescribedLength` with an insertion at rest: output `F_ext = C_z x_w' + K_z (x_w - x_z)`, the
+    negative passive force.
 
     **Arguments:**
 
     - `P_w` [N]: a number (a smooth step from zero) or a signal, as `jaxmuscle.model.RampHold(5.0)`
     - `x_z` [m]: a number
-    - `muscle`, `noise`, `harmonic`, `activation`, `settings`, `initial`: the fields that all tasks have
+    - `muscle`, `noise`, `harmonic`, `activation`, `settings`, `initial`: the fields that all tasks
+      have
     - any other name: a parameter of the table `jaxmuscle.PARAMETERS`, as `k_w=4e5`
 
     **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly.
@@ -261,8 +306,16 @@ class Isometric(PrescribedLength):
         initial: "tuple[Scalar, ...] | None" = None,
         **parameters: "Scalar",
     ):
-        fields = dict(P_w=P_w, x_z=x_z, muscle=muscle, noise=noise, harmonic=harmonic, activation=activation,
-                      settings=settings, initial=initial)  # fmt: skip
+        fields = dict(
+            P_w=P_w,
+            x_z=x_z,
+            muscle=muscle,
+            noise=noise,
+            harmonic=harmonic,
+            activation=activation,
+            settings=settings,
+            initial=initial,
+        )
         fill(self, fields, parameters)
 
     def insertion(self, t: Scalar) -> tuple[Scalar, Scalar, Scalar]:

@@ -1,4 +1,5 @@
-"""What a fit minimises or maximises: coordinates, predicted moments, residuals, likelihood, and the steps that descend it.
+"""What a fit minimises or maximises: coordinates, predicted moments, residuals, likelihood, and the
+steps that descend it.
 
 Every fit, posterior and check is built on these.
 """

@@ -28,7 +28,13 @@ from jaxmuscle.model._parameters import (
     usually_free,
 )
 from jaxmuscle.model._stream import Draws
-from jaxmuscle.model._tasks import AbstractTask, Isometric, Observed, PrescribedForce, PrescribedLength
+from jaxmuscle.model._tasks import (
+    AbstractTask,
+    Isometric,
+    Observed,
+    PrescribedForce,
+    PrescribedLength,
+)
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
@@ -43,24 +49,29 @@ RESIDUALS = ("log", "linear", "cumulative")
 METHODS = ("linear", "montecarlo")
 MOST = 10**9  # of starts, seeds and steps: what is more is a slip
 DT = 2.5e-3
-# With an activation stiffness and damping stay nearer to their defaults: no spectrum determines them, and an underdamped
-# muscle, which swings at 8 Hz, would pass for tremor.
+# With an activation stiffness and damping stay nearer to their defaults: no spectrum determines
+# them, and an underdamped muscle, which swings at 8 Hz, would pass for tremor.
 COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
 NARROW = 0.5
-MASSES = ("m_w", "m_z")  # free where the insertion moves: a perturbation tells m_z, and m_w widens the errors
+# free where the insertion moves: a perturbation tells m_z, and m_w widens the errors
+MASSES = ("m_w", "m_z")
 
 
 def task_for(
-    target: Target, kind: type[AbstractTask] | None = None, *, noise: str | AbstractNoise | None = None
+    target: Target,
+    kind: type[AbstractTask] | None = None,
+    *,
+    noise: str | AbstractNoise | None = None,
 ) -> AbstractTask:
-    """The task that a target measured: `Isometric` for force and torque, `PrescribedLength` for a dynamic stiffness,
-    `PrescribedForce` for displacement and acceleration (with `observe="acceleration"`).
+    """The task that a target measured: `Isometric` for force and torque, `PrescribedLength` for a
+    dynamic stiffness, `PrescribedForce` for displacement and acceleration (with
+    `observe="acceleration"`).
 
         target = jm.load_target("vastus-lateralis-26mvc")
         task = jm.task_for(target, noise="pink")
 
-    Of another `kind` if one is given. It has the target's spectrum settings and default parameters; `noise` is
-    "white", "band-limited", "ornstein-uhlenbeck", "pink", or a noise object.
+    Of another `kind` if one is given. It has the target's spectrum settings and default parameters;
+    `noise` is "white", "band-limited", "ornstein-uhlenbeck", "pink", or a noise object.
     """
     what: Any = target.quantity
     held = Isometric() if target.stiffness is None else PrescribedLength()
@@ -73,27 +84,38 @@ def check_quantity(task: AbstractTask, target: Target, name: str, remedy: str) -
     """Refuse a task whose output is not what the target measured."""
     what = target.quantity
     if task.quantity != ("force" if what == "torque" else what):
-        raise ValueError(f"target {name!r} is a{'n' * (what[0] == 'a')} {what}, but its task {type(task).__name__} gives "
-                         f"{task.output_name} in {task.output_unit}: {remedy}")  # fmt: skip
+        raise ValueError(
+            f"target {name!r} is a{'n' * (what[0] == 'a')} {what}, but its task"
+            f" {type(task).__name__} gives {task.output_name} in {task.output_unit}: {remedy}"
+        )
 
 
 def check_stiffness(task: AbstractTask, target: Target) -> None:
-    """Refuse a dynamic stiffness where the task moves no insertion, and one that chance alone explains."""
+    """Refuse a dynamic stiffness where the task moves no insertion, and one that chance alone
+    explains."""
     if target.stiffness is None:
         return
     if not isinstance(task, PrescribedLength):
-        raise ValueError(f"target {target.name!r} has a dynamic stiffness, which {type(task).__name__} cannot give: fit "
-                         "jaxmuscle.PrescribedLength()")  # fmt: skip
+        raise ValueError(
+            f"target {target.name!r} has a dynamic stiffness, which {type(task).__name__} cannot"
+            " give: fit jaxmuscle.PrescribedLength()"
+        )
     check_seen(target.stiffness, f"target {target.name!r}")
 
 
 def free_names(
-    task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str, float], target: Target, *, moved: bool | None = None
+    task: AbstractTask,
+    free: Iterable[str] | None,
+    fix: Mapping[str, float],
+    target: Target,
+    *,
+    moved: bool | None = None,
 ) -> tuple[str, ...]:
     """The parameters to fit, checked against the task, the fixed ones and the number of data.
 
-    By default those of muscle, noise and rhythms; where the target has no spectrum those of the muscle alone. Where the
-    insertion is moved, here or in another target of the same person, the masses, too.
+    By default those of muscle, noise and rhythms; where the target has no spectrum those of the
+    muscle alone. Where the insertion is moved, here or in another target of the same person, the
+    masses, too.
     """
     moved = target.stiffness is not None if moved is None else moved
     known, bins = task.parameter_names, len(target.bins)
@@ -113,7 +135,10 @@ def free_names(
     if not names:
         raise ValueError("no parameter is free: name at least one in free")
     if bins < len(names):
-        raise ValueError(f"{bins} bins cannot determine {len(names)} free parameters ({', '.join(names)}): fix some")
+        raise ValueError(
+            f"{bins} bins cannot determine {len(names)} free parameters ({', '.join(names)}): fix"
+            " some"
+        )
     return tuple(names)
 
 
@@ -121,15 +146,18 @@ def _check_names(argument: str, names: Iterable[str], known: Iterable[str]) -> N
     known = list(known)
     for name in names:
         if name not in known:
-            raise ValueError(f"{argument}: {unknown_parameter(name, known, what='unknown or not free parameter')}")
+            raise ValueError(
+                f"{argument}:"
+                f" {unknown_parameter(name, known, what='unknown or not free parameter')}"
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FitOptions:
     """How a fit is done: what `fit` and `fit_joint` are asked for, by the names of their arguments.
 
-    `also_free`: what is free besides `free`, whatever that is; `carried`, by which number the task was multiplied to come to
-    a measured mean force.
+    `also_free`: what is free besides `free`, whatever that is; `carried`, by which number the task
+    was multiplied to come to a measured mean force.
     """
 
     free: Iterable[str] | None = None
@@ -163,8 +191,16 @@ class FitOptions:
             check_optimiser(self.optimiser)
         for name, known in (("method", METHODS), ("residual", RESIDUALS)):
             if getattr(self, name) not in known:
-                raise ValueError(f"{name} = {getattr(self, name)!r}: {choices(getattr(self, name), known)}")
-        for name, least in (("starts", 1), ("seeds", 0), ("check_seeds", 0), ("max_steps", 1), ("rungs", 0)):
+                raise ValueError(
+                    f"{name} = {getattr(self, name)!r}: {choices(getattr(self, name), known)}"
+                )
+        for name, least in (
+            ("starts", 1),
+            ("seeds", 0),
+            ("check_seeds", 0),
+            ("max_steps", 1),
+            ("rungs", 0),
+        ):
             if getattr(self, name) is not None:
                 count(name, getattr(self, name), least, MOST)
         check_key(self.key)
@@ -183,10 +219,14 @@ class FitOptions:
         return number_of(self.key)
 
 
-def at_mean(task: AbstractTask, target: Target, options: FitOptions) -> tuple[AbstractTask, FitOptions]:
-    """The task scaled to the target's mean force, where it states one in newtons, which then is data; P_w follows from it.
+def at_mean(
+    task: AbstractTask, target: Target, options: FitOptions
+) -> tuple[AbstractTask, FitOptions]:
+    """The task scaled to the target's mean force, where it states one in newtons, which then is
+    data; P_w follows from it.
 
-    Not where the fit is given a `mean_force` (or False), where P_w is fixed, nor for a muscle that is not the paper's.
+    Not where the fit is given a `mean_force` (or False), where P_w is fixed, nor for a muscle that
+    is not the paper's.
     """
     if options.mean_force is not None:
         return task, dataclasses.replace(options, mean_force=options.mean_force or None)
@@ -197,7 +237,8 @@ def at_mean(task: AbstractTask, target: Target, options: FitOptions) -> tuple[Ab
     free = (*options.also_free, level)
     moved = at_force(task, stated[0])
     factor = float(moved["m_w"]) / float(task["m_w"])
-    if target.stiffness is not None:  # masses are not in ratio to forces where displacements are known
+    # masses are not in ratio to forces where displacements are known
+    if target.stiffness is not None:
         moved = moved.replace(**{name: task[name] for name in MASSES})
     return moved, dataclasses.replace(options, mean_force=stated, also_free=free, carried=factor)
 
@@ -213,16 +254,28 @@ class Plan(NamedTuple):
     seed: int | None
 
 
-def planned(task: AbstractTask, target: Target, options: FitOptions, *, moved: bool | None = None) -> Plan:
+def planned(
+    task: AbstractTask, target: Target, options: FitOptions, *, moved: bool | None = None
+) -> Plan:
     """The fit of one target, its arguments checked (see `fit`). Needs double precision.
 
-    `moved`: whether the insertion was moved in this recording or in another one that is fitted together with it.
+    `moved`: whether the insertion was moved in this recording or in another one that is fitted
+    together with it.
     """
     moved = target.stiffness is not None if moved is None else moved
-    bounds, priors, fix = dict(options.bounds or {}), dict(options.priors or {}), dict(options.fix or {})
+    bounds, priors, fix = (
+        dict(options.bounds or {}),
+        dict(options.priors or {}),
+        dict(options.fix or {}),
+    )
     task = as_numbers(task.with_parts(settings=target.settings).replace(**fix))
     if "acceleration" in (task.quantity, target.quantity):
-        check_quantity(task, target, target.name, "fit jaxmuscle.task_for(target), or state the target's quantity")
+        check_quantity(
+            task,
+            target,
+            target.name,
+            "fit jaxmuscle.task_for(target), or state the target's quantity",
+        )
     check_stiffness(task, target)
     names = free_names(task, options.free, fix, target)
     names += tuple(name for name in options.also_free if name not in names)
@@ -231,41 +284,81 @@ def planned(task: AbstractTask, target: Target, options: FitOptions, *, moved: b
     _check_names("bounds", bounds, names)
     check_line(task, target.settings)
     spectral, settings = len(target.bins) > 0, target.settings
-    require(not spectral or settings.segments(samples_in(WINDOW, settings)) > 0, "length", settings.length,
-            "a fit simulates 10 s, which is shorter than a segment; analyse the data with shorter ones")  # fmt: skip
-    if spectral and not (np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0):
-        raise ValueError("the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say")
+    require(
+        not spectral or settings.segments(samples_in(WINDOW, settings)) > 0,
+        "length",
+        settings.length,
+        "a fit simulates 10 s, which is shorter than a segment; analyse the data with shorter ones",
+    )
+    if spectral and not (
+        np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0
+    ):
+        raise ValueError(
+            "the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say"
+        )
     _check_mean(task, names, mean)
     control = has_response(task, required=options.method == "linear")
-    many = {"starts": 100, "seeds": 32, "check_seeds": 64} if control else {"starts": 8, "seeds": 48, "check_seeds": 200}
+    many = (
+        {"starts": 100, "seeds": 32, "check_seeds": 64}
+        if control
+        else {"starts": 8, "seeds": 48, "check_seeds": 200}
+    )
     many |= {} if spectral else {"seeds": 0, "check_seeds": 0}
-    counts = {name: number if getattr(options, name) is None else getattr(options, name) for name, number in many.items()}
+    counts = {
+        name: number if getattr(options, name) is None else getattr(options, name)
+        for name, number in many.items()
+    }
     if options.method == "montecarlo" and counts["seeds"] < 1:
         raise ValueError("seeds = 0: a Monte Carlo fit needs at least one")
     usual = {n: PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0 for n in names}
-    if task.activation is not None and not moved:  # else a muscle could swing as a tremor does; a response tells that apart
+    # else a muscle could swing as a tremor does; a response tells that apart
+    if task.activation is not None and not moved:
         usual |= {n: NARROW for n in COEFFICIENTS if n in names}
     sds = {n: priors.get(n, usual[n]) for n in names}
-    coordinates = Coordinates.of({n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()})
+    coordinates = Coordinates.of(
+        {n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()}
+    )
     variation = target_variation(target) if options.coefficient_of_variation else None
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, mean)
     key, prior = key_of(options.key), np.array([0.0 if sds[n] is None else 1.0 for n in names])
-    problem = FitProblem((part,), coordinates, prior, options.residual, options.method, options.dt, key, counts["seeds"],
-                         control, options.progress, options.optimiser, options.draws)  # fmt: skip
+    problem = FitProblem(
+        (part,),
+        coordinates,
+        prior,
+        options.residual,
+        options.method,
+        options.dt,
+        key,
+        counts["seeds"],
+        control,
+        options.progress,
+        options.optimiser,
+        options.draws,
+    )
     settings = {
-        **settings_of(problem, bounds), **counts, "max_steps": options.max_steps, "dt": options.dt,
+        **settings_of(problem, bounds),
+        **counts,
+        "max_steps": options.max_steps,
+        "dt": options.dt,
         "increments": options.increments,
         "coefficient_of_variation": variation is not None,
-        "mean_force": None if mean is None else list(mean), "carried": options.carried,
-        "spectrum": target.settings.to_dict(), "steps_per_sample": problem.steps_per_sample,
-    }  # fmt: skip
+        "mean_force": None if mean is None else list(mean),
+        "carried": options.carried,
+        "spectrum": target.settings.to_dict(),
+        "steps_per_sample": problem.steps_per_sample,
+    }
     if options.optimiser is not None:
         settings["optimiser"] = type(options.optimiser).__name__
-    return Plan(problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed)
+    return Plan(
+        problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed
+    )
 
 
-def _check_mean(task: AbstractTask, free: tuple[str, ...], mean: tuple[float, float] | None) -> None:
-    """Refuse a mean force that no stiffness can reach: at x_z = 0, `F_ext = P_w - K_w x_w` lies between 0 and P_w."""
+def _check_mean(
+    task: AbstractTask, free: tuple[str, ...], mean: tuple[float, float] | None
+) -> None:
+    """Refuse a mean force that no stiffness can reach: at x_z = 0, `F_ext = P_w - K_w x_w` lies
+    between 0 and P_w."""
     if mean is not None and task.quantity == "acceleration":
         raise ValueError(f"mean_force = {mean}: the mean of an acceleration is zero; leave it out")
     if mean is None or not isinstance(task, Isometric) or not isinstance(task.muscle, Muscle):
@@ -273,9 +366,11 @@ def _check_mean(task: AbstractTask, free: tuple[str, ...], mean: tuple[float, fl
     value, most = mean[0], float(task["P_w"])
     if float(task["x_z"]) != 0 or (value * most > 0 and (abs(value) < abs(most) or "P_w" in free)):
         return
-    raise ValueError(f"mean_force = {value:g} N cannot be reached: in Isometric the measured force lies between 0 and the "
-                     f"active force, which is P_w = {most:g} N here, whatever the stiffnesses. Carry the muscle to that "
-                     f"force first: task = jaxmuscle.at_force(task, {value:g})")  # fmt: skip
+    raise ValueError(
+        f"mean_force = {value:g} N cannot be reached: in Isometric the measured force lies between"
+        f" 0 and the active force, which is P_w = {most:g} N here, whatever the stiffnesses. Carry"
+        f" the muscle to that force first: task = jaxmuscle.at_force(task, {value:g})"
+    )
 
 
 def settings_of(problem: FitProblem, bounds: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
@@ -285,7 +380,10 @@ def settings_of(problem: FitProblem, bounds: Mapping[str, tuple[float, float]]) 
         "free": list(c.names),
         "residual": problem.residual,
         "prior_centre": dict(zip(c.names, map(float, c.centre), strict=True)),
-        "prior_sd": {n: float(sd) if p else None for n, sd, p in zip(c.names, c.sd, problem.prior, strict=True)},
+        "prior_sd": {
+            n: float(sd) if p else None
+            for n, sd, p in zip(c.names, c.sd, problem.prior, strict=True)
+        },
         "bounds": {n: with_nulls(np.array(b, dtype=float)) for n, b in bounds.items()},
     }
 
@@ -309,8 +407,9 @@ def joint_names(
 ) -> dict[str, dict[str, str]]:
     """The joint name of every target's free parameters.
 
-    A parameter is shared under its own name if all tasks that have it let it be free, unless it is in `separate` or an
-    input (`INPUTS`); then it is called "name@target", or by its own name if only one task has it.
+    A parameter is shared under its own name if all tasks that have it let it be free, unless it is
+    in `separate` or an input (`INPUTS`); then it is called "name@target", or by its own name if
+    only one task has it.
     """
     found: dict[str, dict[str, str]] = {target: {} for target in free}
     for name in dict.fromkeys(n for names in free.values() for n in names):
@@ -322,8 +421,11 @@ def joint_names(
     return found
 
 
-def check_shared(tasks: Mapping[str, AbstractTask], separate: Iterable[str], proportional: Iterable[str]) -> None:
-    """Refuse tasks that cannot be of one person: other values of what they share, other kinds of noise or muscle."""
+def check_shared(
+    tasks: Mapping[str, AbstractTask], separate: Iterable[str], proportional: Iterable[str]
+) -> None:
+    """Refuse tasks that cannot be of one person: other values of what they share, other kinds of
+    noise or muscle."""
     separate, proportional = set(separate), set(proportional)
     known = dict.fromkeys(n for task in tasks.values() for n in task.parameter_names)
     for argument, names in (("separate", separate), ("proportional", proportional)):
@@ -332,17 +434,34 @@ def check_shared(tasks: Mapping[str, AbstractTask], separate: Iterable[str], pro
     if both := sorted(separate & proportional):
         raise ValueError(f"{', '.join(both)} cannot be both separate and proportional")
     for (first, one), (target, other) in itertools.combinations(tasks.items(), 2):
-        shared = [n for n in one.parameter_names if n in other.parameter_names and n not in separate and n not in INPUTS]
+        shared = [
+            n
+            for n in one.parameter_names
+            if n in other.parameter_names and n not in separate and n not in INPUTS
+        ]
         for part, mine in (("noise", "noise_"), ("muscle", "")):
-            names = [n for n in shared if n.startswith("noise_") == bool(mine) and not n.startswith("harmonic_")]
+            names = [
+                n
+                for n in shared
+                if n.startswith("noise_") == bool(mine) and not n.startswith("harmonic_")
+            ]
             a, b = getattr(one, part), getattr(other, part)
             if names and jax.tree.structure(a) != jax.tree.structure(b):
-                kinds = f"{type(a).__name__} and {type(b).__name__}" if type(a) is not type(b) else "differently built"
-                raise ValueError(f"the {part} of task {first!r} and that of {target!r} are {kinds}, so {names[0]} cannot be "
-                                 f"shared: use the same {part}, or list {', '.join(names)} in separate")  # fmt: skip
+                kinds = (
+                    f"{type(a).__name__} and {type(b).__name__}"
+                    if type(a) is not type(b)
+                    else "differently built"
+                )
+                raise ValueError(
+                    f"the {part} of task {first!r} and that of {target!r} are {kinds}, so"
+                    f" {names[0]} cannot be shared: use the same {part}, or list {', '.join(names)}"
+                    " in separate"
+                )
         for name in shared:
             x, y = float(one[name]), float(other[name])
             if name not in proportional and abs(x - y) > SAME * max(abs(x), abs(y)):
-                raise ValueError(f"{name} is {x:g} in task {first!r} and {y:g} in {target!r}, yet they share it: make them "
-                                 "equal, or list it in separate (a value for each) or in proportional (the ratio "
-                                 "kept)")  # fmt: skip
+                raise ValueError(
+                    f"{name} is {x:g} in task {first!r} and {y:g} in {target!r}, yet they share it:"
+                    " make them equal, or list it in separate (a value for each) or in"
+                    " proportional (the ratio kept)"
+                )

@@ -19,8 +19,9 @@ Numbers = TypeVar("Numbers", bound=Float[Array | np.ndarray, "*batch free"])
 class Coordinates(eqx.Module):
     """Free parameters as unconstrained numbers.
 
-    `θ = (ln v - ln v0) / sd` for positive parameters, `(v - v0) / sd` for others, v0 the task's own value and sd the
-    prior's; a parameter with two finite bounds is `θ = low + (high - low) sigmoid(s)`, otherwise θ = s.
+    `θ = (ln v - ln v0) / sd` for positive parameters, `(v - v0) / sd` for others, v0 the task's own
+    value and sd the prior's; a parameter with two finite bounds is `θ = low + (high - low)
+    sigmoid(s)`, otherwise θ = s.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -31,7 +32,9 @@ class Coordinates(eqx.Module):
     high: Float[np.ndarray, " free"]
 
     @classmethod
-    def of(cls, values: dict[str, float], bounds: dict[str, tuple[float, float]], sds: dict[str, float]) -> "Coordinates":
+    def of(
+        cls, values: dict[str, float], bounds: dict[str, tuple[float, float]], sds: dict[str, float]
+    ) -> "Coordinates":
         """Coordinates about the given values. Raises `ValueError` for one that cannot be fitted."""
         rows = {name: PARAMETERS.get(name, _generic(name)) for name in values}
         low, high = [], []
@@ -40,16 +43,25 @@ class Coordinates(eqx.Module):
             a, b = bounds.get(name, (row.fit_lower, row.fit_upper))
             if row.positive and not value > 0:
                 raise ValueError(
-                    f"{name} = {value} cannot be fitted: it is fitted in log space, start from a positive value"
+                    f"{name} = {value} cannot be fitted: it is fitted in log space, start from a"
+                    " positive value"
                 )
             if not a < value < b:
-                raise ValueError(f"{name} = {value} {row.unit} must lie inside its bounds ({a}, {b})")
-            low.append((_log(a) - np.log(value)) / sds[name] if row.positive else (a - value) / sds[name])
-            high.append((_log(b) - np.log(value)) / sds[name] if row.positive else (b - value) / sds[name])
+                raise ValueError(
+                    f"{name} = {value} {row.unit} must lie inside its bounds ({a}, {b})"
+                )
+            low.append(
+                (_log(a) - np.log(value)) / sds[name] if row.positive else (a - value) / sds[name]
+            )
+            high.append(
+                (_log(b) - np.log(value)) / sds[name] if row.positive else (b - value) / sds[name]
+            )
         positive = np.array([rows[name].positive for name in values])
         centre = np.array([float(v) for v in values.values()])
         sd = np.array([sds[name] for name in values])
-        return cls(tuple(values), centre, sd, positive, *_both_or_none(np.array(low), np.array(high)))
+        return cls(
+            tuple(values), centre, sd, positive, *_both_or_none(np.array(low), np.array(high))
+        )
 
     def theta(self, s: Numbers) -> Numbers:
         """Coordinates in standard deviations of the prior."""
@@ -62,14 +74,21 @@ class Coordinates(eqx.Module):
         """dθ/ds."""
         bounded = np.isfinite(self.low)
         share = expit(s)
-        return np.where(bounded, np.where(bounded, self.high - self.low, 1.0) * share * (1 - share), 1.0)
+        return np.where(
+            bounded, np.where(bounded, self.high - self.low, 1.0) * share * (1 - share), 1.0
+        )
 
     def _library(self, given: Any) -> tuple[Any, Any]:
         """NumPy for numbers, which needs no compilation, else JAX; with its sigmoid."""
-        return (np, expit) if isinstance(given, np.ndarray) and isinstance(self.low, np.ndarray) else (jnp, jax.nn.sigmoid)
+        return (
+            (np, expit)
+            if isinstance(given, np.ndarray) and isinstance(self.low, np.ndarray)
+            else (jnp, jax.nn.sigmoid)
+        )
 
     def from_theta(self, theta: Numbers, inset: float = 1e-3) -> Numbers:
-        """The reverse of `theta`, clipped into the bounds: off them by a share `inset` of what lies between."""
+        """The reverse of `theta`, clipped into the bounds: off them by a share `inset` of what lies
+        between."""
         xp, _ = self._library(theta)
         bounded = xp.isfinite(self.low)
         low, high = xp.where(bounded, self.low, 0.0), xp.where(bounded, self.high, 1.0)
@@ -80,13 +99,21 @@ class Coordinates(eqx.Module):
         """Natural values of the parameters at θ."""
         xp, _ = self._library(theta)
         step = self.sd * theta
-        natural = xp.where(self.positive, self.centre * xp.exp(xp.where(self.positive, step, 0.0)), self.centre + step)
+        natural = xp.where(
+            self.positive,
+            self.centre * xp.exp(xp.where(self.positive, step, 0.0)),
+            self.centre + step,
+        )
         return dict(zip(self.names, natural, strict=True))
 
     def values_of(self, theta: Float[np.ndarray, "rows free"]) -> Float[np.ndarray, "rows free"]:
         """Natural values of many θ, in the order of `names`."""
         step = self.sd * theta
-        return np.where(self.positive, self.centre * np.exp(np.where(self.positive, step, 0.0)), self.centre + step)
+        return np.where(
+            self.positive,
+            self.centre * np.exp(np.where(self.positive, step, 0.0)),
+            self.centre + step,
+        )
 
     def at(self, values: Numbers) -> Numbers:
         """θ of the parameters' natural values, in the order of `names`: the reverse of `values`."""
@@ -95,7 +122,9 @@ class Coordinates(eqx.Module):
             ratio = xp.where(self.positive, values, 1.0) / xp.where(self.positive, self.centre, 1.0)
             return xp.where(self.positive, xp.log(ratio), values - self.centre) / self.sd
 
-    def theta_of(self, name: str, values: Float[np.ndarray, "*values"] | float) -> Float[np.ndarray, "*values"]:
+    def theta_of(
+        self, name: str, values: Float[np.ndarray, "*values"] | float
+    ) -> Float[np.ndarray, "*values"]:
         """θ of one positive parameter at natural values."""
         i = self.names.index(name)
         return np.asarray(np.log(values / self.centre[i]) / self.sd[i])
@@ -114,13 +143,16 @@ def _generic(name: str) -> Parameter:
 
 
 def _both_or_none(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where only one bound is finite the other is set 20 prior standard deviations beyond the centre."""
+    """Where only one bound is finite the other is set 20 prior standard deviations beyond the
+    centre."""
     some = np.isfinite(low) | np.isfinite(high)
     low = np.where(some & ~np.isfinite(low), -20.0, low)
     high = np.where(some & ~np.isfinite(high), 20.0, high)
     return np.where(some, low, -np.inf), np.where(some, high, np.inf)
 
 
-def task_at(task: AbstractTask, coordinates: Coordinates, theta: Float[Array | np.ndarray, " free"]) -> AbstractTask:
+def task_at(
+    task: AbstractTask, coordinates: Coordinates, theta: Float[Array | np.ndarray, " free"]
+) -> AbstractTask:
     """The task at coordinates θ."""
     return set_parameters(task, coordinates.values(theta))

@@ -1,4 +1,5 @@
-"""What the scatter of the data leaves undetermined: covariance of parameters, determined directions, in words."""
+"""What the scatter of the data leaves undetermined: covariance of parameters, determined
+directions, in words."""
 
 import itertools
 import re
@@ -15,24 +16,29 @@ from ._moment_models import MonteCarlo
 from ._residuals import PartResiduals
 
 DETERMINED = 3.0
-REDUCED = 1 / (1 + DETERMINED**2)  # of its prior variance is left of a direction that is just determined
+# of its prior variance is left of a direction that is just determined
+REDUCED = 1 / (1 + DETERMINED**2)
 FACTORS = 4
 Vector = Float[np.ndarray, " parameters"]
 
 
 class Identifiability(NamedTuple):
-    """Directions (rows) of the parameters in prior standard deviations, and how steep the data are along each.
+    """Directions (rows) of the parameters in prior standard deviations, and how steep the data are
+    along each.
 
-    `singular_values` are those of the data's Jacobian (residuals in standard deviations); of its prior variance
-    `1 / (1 + σ²)` is left.
+    `singular_values` are those of the data's Jacobian (residuals in standard deviations); of its
+    prior variance `1 / (1 + σ²)` is left.
     """
 
     singular_values: Float[np.ndarray, " parameters"]
     directions: Float[np.ndarray, "parameters parameters"]
 
     @classmethod
-    def of_covariance(cls, covariance: Float[np.ndarray, "parameters parameters"]) -> "Identifiability":
-        """From the covariance of the estimates in prior standard deviations: bins that correlate count for less."""
+    def of_covariance(
+        cls, covariance: Float[np.ndarray, "parameters parameters"]
+    ) -> "Identifiability":
+        """From the covariance of the estimates in prior standard deviations: bins that correlate
+        count for less."""
         left, vectors = np.linalg.eigh(covariance)
         return cls(np.sqrt(np.maximum(1 / np.maximum(left, 1e-300) - 1, 0.0)), vectors.T)
 
@@ -42,14 +48,18 @@ class Identifiability(NamedTuple):
         return self.singular_values >= DETERMINED
 
     def left(self, slope: Vector) -> float:
-        """Share of its prior variance that the data leave of a quantity with these slopes; 1 if it has none."""
+        """Share of its prior variance that the data leave of a quantity with these slopes; 1 if it
+        has none."""
         size = np.linalg.norm(slope)
         if not size > 0:
             return 1.0
-        return float(np.sum((self.directions @ (slope / size)) ** 2 / (1 + self.singular_values**2)))
+        return float(
+            np.sum((self.directions @ (slope / size)) ** 2 / (1 + self.singular_values**2))
+        )
 
     def determines(self, slope: Vector) -> bool:
-        """The one criterion, for parameters and for all that follows from them: at most a tenth of the variance is left."""
+        """The one criterion, for parameters and for all that follows from them: at most a tenth of
+        the variance is left."""
         return self.left(slope) <= REDUCED * (1 + 1e-9)
 
     @property
@@ -59,7 +69,8 @@ class Identifiability(NamedTuple):
 
 
 def identifiability(jacobian: Float[np.ndarray, "residuals parameters"]) -> Identifiability:
-    """Singular value decomposition of the data's Jacobian (residuals in standard deviations, parameters in prior ones)."""
+    """Singular value decomposition of the data's Jacobian (residuals in standard deviations,
+    parameters in prior ones)."""
     size = jacobian.shape[1]
     _, values, directions = np.linalg.svd(np.nan_to_num(jacobian), full_matrices=True)
     return Identifiability(np.concatenate([values, np.zeros(size - len(values))]), directions)
@@ -70,10 +81,11 @@ def parameter_covariance(
     residual_covariance: Float[np.ndarray, "residuals residuals"],
     prior_precision: Float[np.ndarray, " parameters"],
 ) -> Float[np.ndarray, "parameters parameters"]:
-    """Covariance `G (Jᵀ Σ J + Λ) G`, G = (Jᵀ J + Λ)⁻¹, of a penalised least-squares estimate about the truth.
+    """Covariance `G (Jᵀ Σ J + Λ) G`, G = (Jᵀ J + Λ)⁻¹, of a penalised least-squares estimate about
+    the truth.
 
-    Scatter of the data plus the pull of the prior, averaged over truths drawn from it. Where the data determine a
-    direction it is `J⁺ Σ J⁺ᵀ`; where they say nothing it is the prior.
+    Scatter of the data plus the pull of the prior, averaged over truths drawn from it. Where the
+    data determine a direction it is `J⁺ Σ J⁺ᵀ`; where they say nothing it is the prior.
     """
     prior = np.diag(prior_precision)
     gain = np.linalg.pinv(jacobian.T @ jacobian + prior, hermitian=True)
@@ -81,23 +93,41 @@ def parameter_covariance(
 
 
 def effective_parameters(
-    information: Float[np.ndarray, "parameters parameters"], prior_precision: Float[np.ndarray, " parameters"]
+    information: Float[np.ndarray, "parameters parameters"],
+    prior_precision: Float[np.ndarray, " parameters"],
 ) -> float:
-    """`p = tr(F (F + Λ)⁻¹)`, F the Fisher information of the data: how many parameters they determine.
+    """`p = tr(F (F + Λ)⁻¹)`, F the Fisher information of the data: how many parameters they
+    determine.
 
     Murata, Yoshizawa & Amari 1994, doi:10.1109/72.329683.
     """
-    return float(np.trace(information @ np.linalg.pinv(information + np.diag(prior_precision), hermitian=True)))
+    return float(
+        np.trace(
+            information @ np.linalg.pinv(information + np.diag(prior_precision), hermitian=True)
+        )
+    )
 
 
 SCALES = (
     (
-        "all amplitudes of noise and harmonic can be multiplied by one number, and the fit stays as good",
-        ("noise_K_w", "noise_K_z", "noise_P_w", "harmonic_amplitude", "resonance_amplitude", "resonance_2_amplitude"),
+        (
+            "all amplitudes of noise and harmonic can be multiplied by one number, and the fit"
+            " stays as good"
+        ),
+        (
+            "noise_K_w",
+            "noise_K_z",
+            "noise_P_w",
+            "harmonic_amplitude",
+            "resonance_amplitude",
+            "resonance_2_amplitude",
+        ),
     ),
     (
-        "all stiffness and damping can be multiplied by one number, and the fit stays as good: at most their ratios are "
-        "known",
+        (
+            "all stiffness and damping can be multiplied by one number, and the fit stays as good:"
+            " at most their ratios are known"
+        ),
         ("k_w", "k_z", "c_w", "c_z"),
     ),
 )
@@ -106,26 +136,39 @@ SCALES = (
 def common_scales(names: tuple[str, ...], found: Identifiability) -> tuple[str, ...]:
     """Which groups of parameters can be scaled together without the data noticing, in sentences.
 
-    Of a joint fit, where "name@target" belongs to one target, each target's own groups and those that are shared.
+    Of a joint fit, where "name@target" belongs to one target, each target's own groups and those
+    that are shared.
     """
     sentences = []
     split = [name.partition("@") for name in names]
     for target in dict.fromkeys(of for _, _, of in split):
         for sentence, members in SCALES:
-            group = np.array([base in members and of in ("", target) for base, _, of in split], dtype=float)
+            group = np.array(
+                [base in members and of in ("", target) for base, _, of in split], dtype=float
+            )
             size = np.linalg.norm(group)
-            if size > 1 and np.linalg.norm(found.singular_values * (found.directions @ group)) < DETERMINED * size:
+            if (
+                size > 1
+                and np.linalg.norm(found.singular_values * (found.directions @ group))
+                < DETERMINED * size
+            ):
                 sentences.append(sentence + (f" ({target})" if target else ""))
     return tuple(dict.fromkeys(sentences))
 
 
-def known_products(names: tuple[str, ...], positive: Bool[np.ndarray, " parameters"], sd: Vector,
-                   found: Identifiability) -> dict[str, Vector]:  # fmt: skip
-    """The simplest products and ratios of parameters that the data determine, as many as there are such directions.
+def known_products(
+    names: tuple[str, ...],
+    positive: Bool[np.ndarray, " parameters"],
+    sd: Vector,
+    found: Identifiability,
+) -> dict[str, Vector]:
+    """The simplest products and ratios of parameters that the data determine, as many as there are
+    such directions.
 
-    By name ("k_w / c_w"), with the slopes of their logarithms with respect to θ. Fewest factors first, then in the order of
-    the parameters: so equal data give equal words, which the directions themselves, turned by rounding, do not. `sd` are the
-    prior's, `positive` the parameters whose logarithm is meant.
+    By name ("k_w / c_w"), with the slopes of their logarithms with respect to θ. Fewest factors
+    first, then in the order of the parameters: so equal data give equal words, which the directions
+    themselves, turned by rounding, do not. `sd` are the prior's, `positive` the parameters whose
+    logarithm is meant.
     """
     wanted = int(found.determined.sum())
     chosen: dict[str, Vector] = {}
@@ -135,7 +178,9 @@ def known_products(names: tuple[str, ...], positive: Bool[np.ndarray, " paramete
     for factors in range(1, min(FACTORS, len(names)) + 1):
         for which in itertools.combinations(range(len(names)), factors):
             # A factor that is known already would only thin out what is not.
-            if any(held <= set(which) for held in taken) or (factors > 1 and not np.all(positive[list(which)])):
+            if any(held <= set(which) for held in taken) or (
+                factors > 1 and not np.all(positive[list(which)])
+            ):
                 continue
             for signs in itertools.product((-1.0, 1.0), repeat=factors - 1):
                 if len(chosen) == wanted:
@@ -164,7 +209,8 @@ def spelt(product: str) -> str:
 
 
 def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) -> np.ndarray:
-    """Covariance of one target's data residuals: scatter of the target and of the simulated mean."""
+    """Covariance of one target's data residuals: scatter of the target and of the simulated
+    mean."""
     variation, rows = part.data.variation, np.ones(part.data.further)
     if not len(target.bins):
         return np.diag(rows)
@@ -174,7 +220,9 @@ def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) 
     # A linear response has no sampling error, and a control variate leaves next to nothing of it.
     model = part.model
     plain = model if isinstance(model, MonteCarlo) and not model.control else None
-    each = np.zeros(len(share)) if plain is None else log_power_moments(law.degrees * plain.seeds)[1]
+    each = (
+        np.zeros(len(share)) if plain is None else log_power_moments(law.degrees * plain.seeds)[1]
+    )
     sd = np.sqrt(each * np.maximum(1 - share**2, 0.0))
     simulated = sd[:, None] * law.correlation * sd
     measured = part.statistics.covariance
@@ -183,7 +231,12 @@ def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) 
     total = spread @ (measured + simulated) @ spread.T
     if variation is not None:
         rows[0] += 0.25 * float(p @ simulated @ p) / float(variation[1]) ** 2
-    return np.block([[total, np.zeros((len(total), len(rows)))], [np.zeros((len(rows), len(total))), np.diag(rows)]])
+    return np.block(
+        [
+            [total, np.zeros((len(total), len(rows)))],
+            [np.zeros((len(rows), len(total))), np.diag(rows)],
+        ]
+    )
 
 
 def _spread_map(part: PartResiduals, p: np.ndarray) -> np.ndarray:

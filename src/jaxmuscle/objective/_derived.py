@@ -1,4 +1,5 @@
-"""Quantities that follow from a task and its moments: what reports state beside the free parameters."""
+"""Quantities that follow from a task and its moments: what reports state beside the free
+parameters."""
 
 from typing import Any
 
@@ -17,9 +18,26 @@ from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._fluctuations import BANDS, EDGES, in_bands
 
 TANGENTS = ("K_w_tangent", "tangent_stiffness")
-DERIVED = ("corner_frequency", "half_power_frequency", "contraction_time", "tremor_frequency", "tremor_width",
-           "tremor_share", "resonance_2_share", "harmonic_share", "harmonic_frequency", "high_frequency_floor",
-           "K_w0", "K_z0", "C_w0", "C_z0", *TANGENTS, "coefficient_of_variation", "mean", *BANDS)  # fmt: skip
+DERIVED = (
+    "corner_frequency",
+    "half_power_frequency",
+    "contraction_time",
+    "tremor_frequency",
+    "tremor_width",
+    "tremor_share",
+    "resonance_2_share",
+    "harmonic_share",
+    "harmonic_frequency",
+    "high_frequency_floor",
+    "K_w0",
+    "K_z0",
+    "C_w0",
+    "C_z0",
+    *TANGENTS,
+    "coefficient_of_variation",
+    "mean",
+    *BANDS,
+)
 UNITS = {
     "corner_frequency": "Hz",
     "half_power_frequency": "Hz",
@@ -43,7 +61,9 @@ MEANINGS = {
     "tremor_frequency": "frequency of the tremor in the drive, before the muscle smooths it",
     "tremor_width": "full width of the tremor at half power",
     "tremor_share": "the tremor's share of the power, counted from half its frequency on",
-    "resonance_2_share": "the second resonance's share of the power, counted from half its frequency on",
+    "resonance_2_share": (
+        "the second resonance's share of the power, counted from half its frequency on"
+    ),
     "harmonic_share": "the harmonic's share of the power",
     "high_frequency_floor": "mean power of the highest third of the bins, a tremor included",
     "K_w0": "active stiffness without stretch",
@@ -54,26 +74,53 @@ MEANINGS = {
     "tangent_stiffness": "stiffness of both tissues in series, H(0)",
     "coefficient_of_variation": "standard deviation over mean of the output",
     "mean": "mean of the output",
-    **{name: f"share of the power from {low:g} to {high:g} Hz" for name, (low, high) in BANDS.items()},
+    **{
+        name: f"share of the power from {low:g} to {high:g} Hz"
+        for name, (low, high) in BANDS.items()
+    },
 }
 
 
-OF_SPECTRUM = {"harmonic_share", "harmonic_frequency", "high_frequency_floor", "tremor_frequency", "tremor_width",
-               "tremor_share", "resonance_2_share", "coefficient_of_variation", "mean", *BANDS}  # fmt: skip
+OF_SPECTRUM = {
+    "harmonic_share",
+    "harmonic_frequency",
+    "high_frequency_floor",
+    "tremor_frequency",
+    "tremor_width",
+    "tremor_share",
+    "resonance_2_share",
+    "coefficient_of_variation",
+    "mean",
+    *BANDS,
+}
 
 
 def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
-    """The derived quantities that a task has; without a spectrum among the data those of the muscle alone."""
-    frequency, resonances = task.settings.frequency, sum(isinstance(n, ResonantNoise) for n in task.noise.components)
-    covered = np.sum(in_bands(frequency, task.settings.resolution), axis=1) * task.settings.resolution
-    bands = {name for name, there, width in zip(BANDS, covered, np.diff(EDGES), strict=True) if there >= 0.5 * width}
+    """The derived quantities that a task has; without a spectrum among the data those of the muscle
+    alone."""
+    frequency, resonances = (
+        task.settings.frequency,
+        sum(isinstance(n, ResonantNoise) for n in task.noise.components),
+    )
+    covered = (
+        np.sum(in_bands(frequency, task.settings.resolution), axis=1) * task.settings.resolution
+    )
+    bands = {
+        name
+        for name, there, width in zip(BANDS, covered, np.diff(EDGES), strict=True)
+        if there >= 0.5 * width
+    }
     missing = set(BANDS) - bands | (set() if spectrum else OF_SPECTRUM)
     missing |= set() if task.activation is not None else {"contraction_time"}
     missing |= set() if has_tangents(task) else {*TANGENTS}
     missing |= {"tremor_frequency", "tremor_width", "tremor_share"} if resonances < 1 else set()
     missing |= {"resonance_2_share"} if resonances < 2 else set()
     # About a mean of zero, and where the response begins with f².
-    missing |= {"coefficient_of_variation", "mean", "half_power_frequency"} if task.quantity == "acceleration" else set()
+    missing |= (
+        {"coefficient_of_variation", "mean", "half_power_frequency"}
+        if task.quantity == "acceleration"
+        else set()
+    )
     return tuple(name for name in DERIVED if name not in missing)
 
 
@@ -83,10 +130,12 @@ def has_tangents(task: Any) -> bool:
 
 
 def tangents(task: Any, mean: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
-    """Stiffness of the active tissue [N/m] where the mean force stretches it, and of both tissues, slowly pulled.
+    """Stiffness of the active tissue [N/m] where the mean force stretches it, and of both tissues,
+    slowly pulled.
 
     K_w_tangent = d(K_w x_w)/dx_w = k_w (x_ref² + 3 x_w²),   x_w = x_z + mean / K_z(x_z)
-    tangent_stiffness = H(0) = a T / (T + K_z(x_z)),   T = K_w_tangent,   a = K_z(x_z) + 2 k_z x_z (x_z - x_w)
+    tangent_stiffness = H(0) = a T / (T + K_z(x_z)),   T = K_w_tangent,   a = K_z(x_z) + 2 k_z x_z
+    (x_z - x_w)
     """
     x_z = task.x_z(jnp.asarray(HOLD)) if isinstance(task.x_z, AbstractSignal) else task.x_z
     k_w, k_z, x_ref_w, x_ref_z = (task[name] for name in ("k_w", "k_z", "x_ref_w", "x_ref_z"))
@@ -97,22 +146,26 @@ def tangents(task: Any, mean: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
     return {"K_w_tangent": active, "tangent_stiffness": slope * active / (active + passive)}
 
 
-def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " bins"] | None = None) -> dict[str, Any]:
+def derived(
+    task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " bins"] | None = None
+) -> dict[str, Any]:
     """What the data can determine.
 
-    `corner_frequency` |λ_slow|/2π of the operating point; `half_power_frequency` of the slow part, relaxation and activation
-    together; `contraction_time`, where there is an activation; where there is a resonance `tremor_frequency`,
-    `tremor_width` and `tremor_share` of the compared power, and `resonance_2_share` of a second one, both from half the
-    resonance's frequency on (what activation and muscle let through below is no peak and can hardly be told from the rest);
-    `harmonic_share` of the compared power; `harmonic_frequency`; `high_frequency_floor`, mean proportional power per bin
-    over the highest third of the bins; the base coefficients; where the insertion is moved `tangents`;
-    `coefficient_of_variation` and `mean` of the output (not of an acceleration, whose mean is zero, and which has no
-    `half_power_frequency`);
-    `band_4_8` and so on, the proportional power from 4 to 8 Hz, of bins at the edges the part that lies inside, where the
-    bins cover half of the band.
+    `corner_frequency` |λ_slow|/2π of the operating point; `half_power_frequency` of the slow part,
+    relaxation and activation together; `contraction_time`, where there is an activation; where
+    there is a resonance `tremor_frequency`, `tremor_width` and `tremor_share` of the compared
+    power, and `resonance_2_share` of a second one, both from half the resonance's frequency on
+    (what activation and muscle let through below is no peak and can hardly be told from the rest);
+    `harmonic_share` of the compared power; `harmonic_frequency`; `high_frequency_floor`, mean
+    proportional power per bin over the highest third of the bins; the base coefficients; where the
+    insertion is moved `tangents`; `coefficient_of_variation` and `mean` of the output (not of an
+    acceleration, whose mean is zero, and which has no `half_power_frequency`); `band_4_8` and so
+    on, the proportional power from 4 to 8 Hz, of bins at the edges the part that lies inside, where
+    the bins cover half of the band.
     """
     base, seen = task.muscle.base(), observed(moments)
-    at: Any = task.settings.frequency if frequency is None else frequency  # of the bins, if not all are compared
+    # of the bins, if not all are compared
+    at: Any = task.settings.frequency if frequency is None else frequency
     resonances = [noise for noise in task.noise.components if isinstance(noise, ResonantNoise)]
     whole, one = moments.power.sum(), jnp.ones(())
     found: dict[str, Any] = {
@@ -121,7 +174,9 @@ def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " 
     }
     if task.activation is not None:
         found["contraction_time"] = task.activation.time * one
-    for name, noise, own in zip(("tremor", "resonance_2"), resonances, moments.resonant, strict=False):
+    for name, noise, own in zip(
+        ("tremor", "resonance_2"), resonances, moments.resonant, strict=False
+    ):
         if name == "tremor":
             found |= {"tremor_frequency": noise.frequency * one, "tremor_width": noise.width * one}
         peak = at >= 0.5 * jax.lax.stop_gradient(noise.frequency)
@@ -160,12 +215,19 @@ def jackknife(each: Moments) -> dict[str, float]:
     count = len(each.mean)
     if count < 2:
         return {}
-    left_out = [observed(jax.tree.map(lambda x, i=i: (x.sum(axis=0) - x[i]) / (count - 1), each)) for i in range(count)]
-    return {name: float(np.std([o[name] for o in left_out]) * np.sqrt(count - 1)) for name in left_out[0]}
+    left_out = [
+        observed(jax.tree.map(lambda x, i=i: (x.sum(axis=0) - x[i]) / (count - 1), each))
+        for i in range(count)
+    ]
+    return {
+        name: float(np.std([o[name] for o in left_out]) * np.sqrt(count - 1))
+        for name in left_out[0]
+    }
 
 
 def unit_of(name: str, output: str = "") -> str:
-    """Unit of a parameter or derived quantity, "name@target" too; `output` is that of the task's output."""
+    """Unit of a parameter or derived quantity, "name@target" too; `output` is that of the task's
+    output."""
     base = name.partition("@")[0]
     if base == "mean":
         return output

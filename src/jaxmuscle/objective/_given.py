@@ -23,18 +23,31 @@ def check_named(free: Any, fix: Any, bounds: Any, priors: Any) -> None:
             raise ValueError(f"bounds[{name!r}] = {pair!r}: give two numbers, the lower first")
     for name, sd in _entries("priors", priors):
         if sd is not None and not (is_real(sd) and sd > 0):
-            raise ValueError(f"priors[{name!r}] = {sd!r}: give a standard deviation above 0, or None for a flat prior")
+            raise ValueError(
+                f"priors[{name!r}] = {sd!r}: give a standard deviation above 0, or None for a flat"
+                " prior"
+            )
 
 
 def check_data(coefficient_of_variation: Any, mean_force: Any) -> None:
     """Raise a `ValueError` for what does not say whether and which further data there are."""
     if not isinstance(coefficient_of_variation, bool):
-        raise ValueError(f"coefficient_of_variation = {coefficient_of_variation!r}: give True or False, whether it is data")
+        raise ValueError(
+            f"coefficient_of_variation = {coefficient_of_variation!r}: give True or False, whether"
+            " it is data"
+        )
     if mean_force is None or mean_force is False:
         return
-    pair = mean_force if isinstance(mean_force, tuple | list) and len(mean_force) == 2 else (math.nan, math.nan)
+    pair = (
+        mean_force
+        if isinstance(mean_force, tuple | list) and len(mean_force) == 2
+        else (math.nan, math.nan)
+    )
     if not (is_real(pair[0]) and is_real(pair[1]) and pair[1] > 0):
-        raise ValueError(f"mean_force = {mean_force!r}: give the mean and its standard error [N], as (20.0, 0.4), or False")
+        raise ValueError(
+            f"mean_force = {mean_force!r}: give the mean and its standard error [N], as (20.0,"
+            " 0.4), or False"
+        )
 
 
 def _entries(argument: str, given: Any) -> Iterable[tuple[str, Any]]:

@@ -1,4 +1,5 @@
-"""Levenberg-Marquardt from many starts at once, one optimistix step at a time, so that it can be watched and stopped."""
+"""Levenberg-Marquardt from many starts at once, one optimistix step at a time, so that it can be
+watched and stopped."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,12 +16,15 @@ from ._consequences import Expansion, expand
 SMALL = 1e-3
 STILL = 1e-4
 REFUSALS = 10
-HOPELESS = 0.005  # of the way to where it would count, gained by a step: a start that needs two hundred more such steps
+# of the way to where it would count, gained by a step: a start that needs two hundred more such
+# steps
+HOPELESS = 0.005
 ROWS = 128
 
 
 class Minima(NamedTuple):
-    """Where each start stands: coordinates, cost `½ Σ r²`, steps tried, and whether its last step gained little."""
+    """Where each start stands: coordinates, cost `½ Σ r²`, steps tried, and whether its last step
+    gained little."""
 
     s: Float[np.ndarray, "starts free"]
     cost: Float[np.ndarray, " starts"]
@@ -33,8 +37,11 @@ class Minima(NamedTuple):
         return int(np.argmin(np.where(np.isfinite(self.cost), self.cost, np.inf)))
 
 
-def _residuals(s: Float[Array, " free"], given: tuple[Any, Any, Expansion]) -> tuple[Float[Array, " residuals"], None]:
-    """Residuals with their slopes at the s where the model was seen: all that a Levenberg-Marquardt step asks for."""
+def _residuals(
+    s: Float[Array, " free"], given: tuple[Any, Any, Expansion]
+) -> tuple[Float[Array, " residuals"], None]:
+    """Residuals with their slopes at the s where the model was seen: all that a Levenberg-Marquardt
+    step asks for."""
     objective, data, seen = given
     theta = objective.theta(s)
     return objective.residuals(theta, seen.near(theta), data), None
@@ -54,9 +61,11 @@ def check_optimiser(optimiser: Any) -> None:
 
     if not isinstance(optimiser, optx.AbstractGaussNewton):
         given = optimiser.__name__ if isinstance(optimiser, type) else type(optimiser).__name__
-        raise ValueError(f"optimiser: this is {given}; give a least-squares solver of optimistix that makes Gauss-Newton "
-                         "steps, as optimistix.Dogleg(1e-9, 1e-9); for any other there is jaxmuscle.problem(task, "
-                         "target)")  # fmt: skip
+        raise ValueError(
+            f"optimiser: this is {given}; give a least-squares solver of optimistix that makes"
+            " Gauss-Newton steps, as optimistix.Dogleg(1e-9, 1e-9); for any other there is"
+            " jaxmuscle.problem(task, target)"
+        )
 
 
 def _initial(objective, data, s, seen):
@@ -76,16 +85,27 @@ def _start(objective, data, starts, seen):
 @kept
 def _step(objective, data, s, state, seen):
     def one(data, s, state, seen):
-        shapes, functions = eqx.partition(eqx.filter_eval_shape(_initial, objective, data, s, seen), _is_shape)
+        shapes, functions = eqx.partition(
+            eqx.filter_eval_shape(_initial, objective, data, s, seen), _is_shape
+        )
         state = eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), state), functions)
-        s, state, _ = _solver(objective).step(_residuals, s, (objective, data, seen), {}, state, frozenset())
-        return s, _arrays(state), state.y_eval, 0.5 * (state.f_info.residual**2).sum(), state.num_accepted_steps
+        s, state, _ = _solver(objective).step(
+            _residuals, s, (objective, data, seen), {}, state, frozenset()
+        )
+        return (
+            s,
+            _arrays(state),
+            state.y_eval,
+            0.5 * (state.f_info.residual**2).sum(),
+            state.num_accepted_steps,
+        )
 
     return eqx.filter_vmap(one)(data, s, state, seen)
 
 
 def _arrays(state):
-    """The arrays of a solver's state, all that goes from program to program: no file can keep its functions."""
+    """The arrays of a solver's state, all that goes from program to program: no file can keep its
+    functions."""
     return jax.tree.leaves(eqx.filter(state, eqx.is_array))
 
 
@@ -94,7 +114,8 @@ def _is_shape(leaf):
 
 
 class _Standing(NamedTuple):
-    """Every start (and filled-up) row: where it is and looks next, its cost, accepted steps, successive small gains."""
+    """Every start (and filled-up) row: where it is and looks next, its cost, accepted steps,
+    successive small gains."""
 
     s: np.ndarray
     ahead: np.ndarray
@@ -108,7 +129,12 @@ class _Standing(NamedTuple):
     active: np.ndarray
 
     def advanced(
-        self, s: np.ndarray, ahead: np.ndarray, cost: np.ndarray, accepted: np.ndarray, margin: float
+        self,
+        s: np.ndarray,
+        ahead: np.ndarray,
+        cost: np.ndarray,
+        accepted: np.ndarray,
+        margin: float,
     ) -> "_Standing":
         """After a step of the active rows; the others stay as they are."""
         moved = self.active & (accepted > self.accepted)
@@ -152,12 +178,13 @@ def least_squares(
 ) -> Minima:
     """Minimise `½ Σ r²`, `r = objective.residuals(θ, moments at θ, data)`, from every start.
 
-    `data` has a leading axis of starts: each may have data of its own; without it all have the objective's.
-    Steps to where r is not finite are rejected. A start ends when two accepted steps in a row lower its cost by less than
-    `STILL` of it, after `REFUSALS` rejected steps in a row, or if it is not finite; what has ended costs nothing more. It
-    also ends when two accepted steps in a row gain less than `HOPELESS` of what its cost is above the best by more than
-    `margin`.
-    `prepare(objective, points)` may exchange the objective before each step (sub-steps); `report` sees every step's outcome.
+    `data` has a leading axis of starts: each may have data of its own; without it all have the
+    objective's. Steps to where r is not finite are rejected. A start ends when two accepted steps
+    in a row lower its cost by less than `STILL` of it, after `REFUSALS` rejected steps in a row, or
+    if it is not finite; what has ended costs nothing more. It also ends when two accepted steps in
+    a row gain less than `HOPELESS` of what its cost is above the best by more than `margin`.
+    `prepare(objective, points)` may exchange the objective before each step (sub-steps); `report`
+    sees every step's outcome.
     """
     count, free = starts.shape
     batched = objective.linear
@@ -166,7 +193,9 @@ def least_squares(
     none, nothing = np.zeros(len(s), dtype=int), np.full(len(s), np.inf)
     now = _Standing(s, s, nothing, none, none, none, none, none, none, np.arange(len(s)) < count)
     last = np.minimum(np.arange(count + fill), count - 1)
-    data = jax.tree.map(lambda x: np.asarray(x)[last], for_all(objective.data, count) if data is None else data)
+    data = jax.tree.map(
+        lambda x: np.asarray(x)[last], for_all(objective.data, count) if data is None else data
+    )
     seen = state = None
     for _ in range(max_steps):
         rows = np.flatnonzero(now.active) if batched else np.arange(count)

@@ -1,4 +1,5 @@
-"""The likelihood of a Welch spectrum: chi-squared bins with their bias and correlation, and spectra drawn from it."""
+"""The likelihood of a Welch spectrum: chi-squared bins with their bias and correlation, and spectra
+drawn from it."""
 
 import math
 from collections.abc import Sequence
@@ -59,18 +60,25 @@ def require_spread(target: Target) -> None:
     """Raises `ValueError` for a target that states neither segments nor sigma."""
     if target.segments is None and target.sigma is None and len(target.bins):
         raise ValueError(
-            f"{target.name}: states neither segments nor sigma, so how much its bins scatter is not known: give segments, "
-            "the number of Welch segments that were averaged (--segments), or a sigma per bin"
+            f"{target.name}: states neither segments nor sigma, so how much its bins scatter is not"
+            " known: give segments, the number of Welch segments that were averaged (--segments),"
+            " or a sigma per bin"
         )
 
 
 def measured_bins(target: Target, mask: np.ndarray | None = None) -> Bins:
-    """A target's bins with their law, those with `mask` 0 left out. Raises `ValueError` for one that states no segments."""
+    """A target's bins with their law, those with `mask` 0 left out. Raises `ValueError` for one
+    that states no segments."""
     if target.segments is None:
-        raise ValueError(f"{target.name}: does not state its segments, so how its bins scatter is not known; give segments")
+        raise ValueError(
+            f"{target.name}: does not state its segments, so how its bins scatter is not known;"
+            " give segments"
+        )
     law = target_law(target)
     kept = np.ones(len(target.bins)) if mask is None else np.asarray(mask, dtype=float)
-    return Bins(np.log(target.proportional_power), law.degrees / 2, *_precision(law.correlation, kept), kept)
+    return Bins(
+        np.log(target.proportional_power), law.degrees / 2, *_precision(law.correlation, kept), kept
+    )
 
 
 def _precision(correlation: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -82,13 +90,15 @@ def _precision(correlation: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, n
 
 
 def log_density(bins: Bins, power: ManyPowers, line: ManyPowers, offset: Scalar) -> Many:
-    """Log density of proportional powers p and of the log of their total, `offset` above the model's.
+    """Log density of proportional powers p and of the log of their total, `offset` above the
+    model's.
 
-    `x_k = e^u (p_k / Σp) / (E_k / ΣE)` are gamma variables of shape ν_k/2 and mean 1, ν_k raised by 1 / (1 - ρ_k²) where a
-    line holds the share ρ_k of the bin. They are joined by a Gaussian copula: their normal scores (Wilson & Hilferty 1931,
-    `z = 3 √a (x^⅓ - 1 + 1/(9a))`, a = ν/2) have the correlation matrix R of the bins. With a flat density of u the total,
-    which proportional powers do not show, is integrated out by integrating over u. For many models at once their axes come
-    last, so that sums over bins are sums of vectors.
+    `x_k = e^u (p_k / Σp) / (E_k / ΣE)` are gamma variables of shape ν_k/2 and mean 1, ν_k raised by
+    1 / (1 - ρ_k²) where a line holds the share ρ_k of the bin. They are joined by a Gaussian
+    copula: their normal scores (Wilson & Hilferty 1931, `z = 3 √a (x^⅓ - 1 + 1/(9a))`, a = ν/2)
+    have the correlation matrix R of the bins. With a flat density of u the total, which
+    proportional powers do not show, is integrated out by integrating over u. For many models at
+    once their axes come last, so that sums over bins are sums of vectors.
     """
     return _log_density(power, line, offset, jax.lax.stop_gradient(bins))
 
@@ -105,9 +115,15 @@ def _slope(primals, tangents):
     return value, jnp.sum(by_power * power + by_line * line, axis=0) + by_offset * offset
 
 
-def _with_slopes(power: ManyPowers, line: ManyPowers, offset: Scalar, bins: Bins) -> tuple[Many, tuple[Array, Array, Array]]:
-    """`log_density` and its slopes, by hand: a posterior's time goes there, and what JAX makes of it takes twice as long."""
-    log_power, half, mask = (jnp.reshape(x, (-1,) + (1,) * (power.ndim - 1)) for x in (bins.log_power, bins.half, bins.mask))
+def _with_slopes(
+    power: ManyPowers, line: ManyPowers, offset: Scalar, bins: Bins
+) -> tuple[Many, tuple[Array, Array, Array]]:
+    """`log_density` and its slopes, by hand: a posterior's time goes there, and what JAX makes of
+    it takes twice as long."""
+    log_power, half, mask = (
+        jnp.reshape(x, (-1,) + (1,) * (power.ndim - 1))
+        for x in (bins.log_power, bins.half, bins.mask)
+    )
     share = jnp.clip(line / power, 0.0, 1.0)
     scatters = 1 - share**2
     a = half / jnp.maximum(scatters, LEAST)
@@ -129,13 +145,16 @@ def _with_slopes(power: ManyPowers, line: ManyPowers, offset: Scalar, bins: Bins
 
 
 def _gamma_level(a: Many) -> tuple[Array, Array]:
-    """`a ln a - ln Γ(a)` for a >= 0.5 to 1e-7, and its slope, by Stirling's series at a + 3: JAX's own takes longer."""
+    """`a ln a - ln Γ(a)` for a >= 0.5 to 1e-7, and its slope, by Stirling's series at a + 3: JAX's
+    own takes longer."""
     b = a + 3
     r = 1 / b
     series = r * (1 / 12 - r**2 * (1 / 360 - r**2 / 1260))
     falling = r**2 * (1 / 12 - r**2 * (1 / 120 - r**2 / 252))
     ratio = jnp.log(a * r)
-    level = a * ratio + b - HALF_LOG_2_PI - series + jnp.log(a * (a + 1) * (a + 2) * r**2 * jnp.sqrt(r))
+    level = (
+        a * ratio + b - HALF_LOG_2_PI - series + jnp.log(a * (a + 1) * (a + 2) * r**2 * jnp.sqrt(r))
+    )
     return level, ratio + 1 + 0.5 * r + falling + 1 / a + 1 / (a + 1) + 1 / (a + 2)
 
 
@@ -143,7 +162,8 @@ def likeliest_offset(bins: Bins, power: Powers, line: Powers) -> tuple[Scalar, S
     """The u of highest density and its standard deviation by the curvature there."""
     slope = jax.grad(lambda u: log_density(bins, power, line, u))
     curvature = jax.grad(slope)
-    least = 0.05 * jnp.sum(bins.mask * bins.half)  # keeps Newton's steps finite far from the maximum
+    # keeps Newton's steps finite far from the maximum
+    least = 0.05 * jnp.sum(bins.mask * bins.half)
 
     def step(_, u):
         return u + jnp.clip(slope(u) / jnp.maximum(-curvature(u), least), -1.0, 1.0)
@@ -154,7 +174,8 @@ def likeliest_offset(bins: Bins, power: Powers, line: Powers) -> tuple[Scalar, S
 
 @jax.jit  # a user calls it outside a program, too, and its loop would be traced anew each time
 def log_marginal(bins: Bins, power: Powers, line: Powers) -> Scalar:
-    """Log density of proportional powers: `log_density` integrated over the offset, by the trapezoidal rule."""
+    """Log density of proportional powers: `log_density` integrated over the offset, by the
+    trapezoidal rule."""
     middle, width = jax.tree.map(jax.lax.stop_gradient, likeliest_offset(bins, power, line))
     nodes = middle + width * jnp.linspace(-REACH, REACH, NODES)
     values = jax.vmap(lambda u: log_density(bins, power, line, u))(nodes)
@@ -167,8 +188,9 @@ AllBins = tuple[Bins | None, ...]
 class Likelihood(eqx.Module):
     """Log likelihood of a fit's data as a function of its model's moments.
 
-    Of a target with segments: the gamma law of Welch bins, with an offset of its own. Without, but with a sigma: Gaussian in
-    the residual of the fit (`bins` is None there). Further residuals (coefficient of variation, mean) are Gaussian.
+    Of a target with segments: the gamma law of Welch bins, with an offset of its own. Without, but
+    with a sigma: Gaussian in the residual of the fit (`bins` is None there). Further residuals
+    (coefficient of variation, mean) are Gaussian.
     """
 
     objective: Residuals
@@ -176,23 +198,33 @@ class Likelihood(eqx.Module):
 
     @classmethod
     def of(cls, problem: FitProblem) -> "Likelihood":
-        """Of the problem's targets. Raises `ValueError` if one states neither segments nor sigma."""
+        """Of the problem's targets. Raises `ValueError` if one states neither segments nor
+        sigma."""
         for part in problem.parts:
             require_spread(part.target)
-        bins = (None if p.target.segments is None else as_arrays(measured_bins(p.target)) for p in problem.parts)
+        bins = (
+            None if p.target.segments is None else as_arrays(measured_bins(p.target))
+            for p in problem.parts
+        )
         return cls(problem.linear(), tuple(bins))
 
     def at(
-        self, moments: tuple[Moments, ...], offsets: Float[Array | np.ndarray, " parts"], bins: AllBins | None = None
+        self,
+        moments: tuple[Moments, ...],
+        offsets: Float[Array | np.ndarray, " parts"],
+        bins: AllBins | None = None,
     ) -> Scalar:
-        """Log density of data and offsets (which count in the gamma law only) where the model has these moments."""
+        """Log density of data and offsets (which count in the gamma law only) where the model has
+        these moments."""
         each = zip(range(len(self.bins)), moments, self.bins if bins is None else bins, strict=True)
         return sum((self.of_part(i, m, offsets[i], own) for i, m, own in each), start=jnp.zeros(()))
 
     def of_part(self, i: int, moments: Moments, offset: Scalar, bins: Bins | None) -> Scalar:
         """Log density of one target's data and offset."""
         if bins is None:
-            return _gaussian(self.objective.parts[i].data_residuals(moments, self.objective.parts[i].data))
+            return _gaussian(
+                self.objective.parts[i].data_residuals(moments, self.objective.parts[i].data)
+            )
         return log_density(bins, moments.power, moments.line, offset) + self.further(i, moments)
 
     def further(self, i: int, moments: Moments) -> Scalar:
@@ -202,15 +234,20 @@ class Likelihood(eqx.Module):
     def marginal(self, moments: tuple[Moments, ...], bins: AllBins | None = None) -> Scalar:
         """The same with the offsets integrated out."""
         found = jnp.zeros(())
-        for part, m, own in zip(self.objective.parts, moments, self.bins if bins is None else bins, strict=True):
+        for part, m, own in zip(
+            self.objective.parts, moments, self.bins if bins is None else bins, strict=True
+        ):
             if own is None:
                 found += _gaussian(part.data_residuals(m, part.data))
             else:
-                found += log_marginal(own, m.power, m.line) + _gaussian(further_residuals(m, part.data))
+                found += log_marginal(own, m.power, m.line) + _gaussian(
+                    further_residuals(m, part.data)
+                )
         return found
 
     def information(self, seen: Expansion, bins: AllBins | None = None) -> Float[Array, "all all"]:
-        """Fisher information of (θ, offsets), `Jᵀ C⁻¹ J`: C the bins' covariance in the log, 2 R_kl / √(ν_k ν_l).
+        """Fisher information of (θ, offsets), `Jᵀ C⁻¹ J`: C the bins' covariance in the log, 2 R_kl
+        / √(ν_k ν_l).
 
         What the line tells by how little a bin scatters is left out.
         """
@@ -220,28 +257,47 @@ class Likelihood(eqx.Module):
 
             def rows(theta, i=i, part=part, own=own):
                 moments = seen.near(theta)[i]
-                return part.data_residuals(moments, part.data) if own is None else further_residuals(moments, part.data)
+                return (
+                    part.data_residuals(moments, part.data)
+                    if own is None
+                    else further_residuals(moments, part.data)
+                )
 
             gaussian = jnp.pad(jax.jacfwd(rows)(seen.theta), ((0, 0), (0, len(parts))))
             found += gaussian.T @ gaussian
             if own is not None:
                 m, slopes = seen.moments[i], seen.slopes[i]
-                weight = own.mask * jnp.sqrt(own.half / jnp.maximum(1 - jnp.clip(m.line / m.power, 0, 1) ** 2, LEAST))
-                logs = jnp.sum(slopes.power, axis=0) / jnp.sum(m.power) - slopes.power / m.power[:, None]
+                weight = own.mask * jnp.sqrt(
+                    own.half / jnp.maximum(1 - jnp.clip(m.line / m.power, 0, 1) ** 2, LEAST)
+                )
+                logs = (
+                    jnp.sum(slopes.power, axis=0) / jnp.sum(m.power)
+                    - slopes.power / m.power[:, None]
+                )
                 offset = jnp.broadcast_to(jnp.eye(len(parts))[i], (len(logs), len(parts)))
                 scaled = weight[:, None] * jnp.concatenate([logs, offset], axis=1)
                 found += scaled.T @ own.precision @ scaled
         return found
 
 
-def without_offsets(information: Float[np.ndarray, "all all"], free: int) -> Float[np.ndarray, "free free"]:
-    """Fisher information of θ where the offsets, the last coordinates, are unknown: its Schur complement."""
-    inner, cross, own = information[:free, :free], information[:free, free:], information[free:, free:]
+def without_offsets(
+    information: Float[np.ndarray, "all all"], free: int
+) -> Float[np.ndarray, "free free"]:
+    """Fisher information of θ where the offsets, the last coordinates, are unknown: its Schur
+    complement."""
+    inner, cross, own = (
+        information[:free, :free],
+        information[:free, free:],
+        information[free:, free:],
+    )
     return inner - cross @ np.linalg.pinv(own, hermitian=True) @ cross.T
 
 
-def drawn_spectra(bins: Bins | None, target: Target, moments: Moments, key: Array) -> Float[np.ndarray, "rows bins"]:
-    """Proportional powers scattering about the model's: correlated gamma variables, or Gaussian in the log with a sigma."""
+def drawn_spectra(
+    bins: Bins | None, target: Target, moments: Moments, key: Array
+) -> Float[np.ndarray, "rows bins"]:
+    """Proportional powers scattering about the model's: correlated gamma variables, or Gaussian in
+    the log with a sigma."""
     normal = np.asarray(jax.random.normal(key, np.shape(moments.power)))
     power = np.asarray(moments.power)
     if bins is None:
@@ -261,12 +317,20 @@ def _gaussian(residuals: Float[Array | np.ndarray, " rows"]) -> Scalar:
 @kept
 def _target_likelihood(task, bins, chosen, variation, samples, stiffness):
     moments, system = expected_moments(task, task.settings, WINDOW, samples)
-    found = jnp.zeros(()) if bins is None else log_marginal(bins, moments.power[chosen], moments.line[chosen])
+    found = (
+        jnp.zeros(())
+        if bins is None
+        else log_marginal(bins, moments.power[chosen], moments.line[chosen])
+    )
     if stiffness is not None:
         f, measured, sd = stiffness
-        found += jnp.sum(-0.5 * ((parts_of_stiffness(task, system, f) - measured) / sd) ** 2 - jnp.log(sd))
+        found += jnp.sum(
+            -0.5 * ((parts_of_stiffness(task, system, f) - measured) / sd) ** 2 - jnp.log(sd)
+        )
     if variation is not None:
-        found += _gaussian(((jnp.log(moments.variation) - variation[0]) / variation[1])[None]) - jnp.log(variation[1])
+        found += _gaussian(
+            ((jnp.log(moments.variation) - variation[0]) / variation[1])[None]
+        ) - jnp.log(variation[1])
     return found
 
 
@@ -275,7 +339,9 @@ def _whittle(task, settings, power, window):
     moments = expected_moments(task, settings, window)[0]
     noise, line = moments.power - moments.line, moments.line
     argument = 2 * jnp.sqrt(power * line) / noise
-    return jnp.sum(jnp.log(i0e(argument)) - jnp.log(noise) - (jnp.sqrt(power) - jnp.sqrt(line)) ** 2 / noise)
+    return jnp.sum(
+        jnp.log(i0e(argument)) - jnp.log(noise) - (jnp.sqrt(power) - jnp.sqrt(line)) ** 2 / noise
+    )
 
 
 def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
@@ -284,22 +350,23 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
         target = jm.load_target("vastus-lateralis-26mvc")
         jm.log_likelihood(jm.task_for(target), target)
 
-    A `Target` with segments: its Welch bins are correlated gamma variables about the expected spectrum
-    (docs/uncertainty.md, *The likelihood*), their unknown total integrated out; with its coefficient of variation as one
-    more datum, Gaussian in the log with the standard deviation that it has under this task, if it states one; and with its
-    dynamic stiffness, Gaussian in real and imaginary part with the errors that it states, if it has one. A `Recording`: the
-    Whittle likelihood of the periodogram of its window, in its own units, between the first and last bin of the task's
-    settings, about the *expected* periodogram of a window of that length (leakage and aliases included: debiased Whittle,
-    Sykulski et al. 2019, doi:10.1093/biomet/asy071). With the periodogram I_k and its
-    expectation E_k = N_k + L_k, N_k from the noise and L_k from the line,
+    A `Target` with segments: its Welch bins are correlated gamma variables about the expected
+    spectrum (docs/uncertainty.md, *The likelihood*), their unknown total integrated out; with its
+    coefficient of variation as one more datum, Gaussian in the log with the standard deviation that
+    it has under this task, if it states one; and with its dynamic stiffness, Gaussian in real and
+    imaginary part with the errors that it states, if it has one. A `Recording`: the Whittle
+    likelihood of the periodogram of its window, in its own units, between the first and last bin of
+    the task's settings, about the *expected* periodogram of a window of that length (leakage and
+    aliases included: debiased Whittle, Sykulski et al. 2019, doi:10.1093/biomet/asy071). With the
+    periodogram I_k and its expectation E_k = N_k + L_k, N_k from the noise and L_k from the line,
 
         Σ_k [ln I0(2 √(I_k L_k) / N_k) - (I_k + L_k) / N_k - ln N_k],
 
-    the noncentral chi-squared law with two degrees of freedom (I0 is the modified Bessel function); without a line
-    `-Σ (ln E_k + I_k / E_k)`.
+    the noncentral chi-squared law with two degrees of freedom (I0 is the modified Bessel function);
+    without a line `-Σ (ln E_k + I_k / E_k)`.
 
-    **Raises:** `ValueError` for a target without segments, a harmonic beyond half the sampling rate, and a
-    recording whose window is constant, too short, or sampled too slowly for the bins.
+    **Raises:** `ValueError` for a target without segments, a harmonic beyond half the sampling
+    rate, and a recording whose window is constant, too short, or sampled too slowly for the bins.
     """
     if all_concrete(task):
         check_line(task, task.settings)
@@ -313,7 +380,13 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
         stiffness = None
         if data.stiffness is not None:
             known = data.stiffness.known
-            stiffness = as_arrays((known.frequency, np.stack([np.real(known.value), np.imag(known.value)]), known.stderr))
+            stiffness = as_arrays(
+                (
+                    known.frequency,
+                    np.stack([np.real(known.value), np.imag(known.value)]),
+                    known.stderr,
+                )
+            )
         chosen = data.bins - data.settings.first_bin
         return _target_likelihood(as_arrays(task), bins, chosen, variation, samples, stiffness)
     whole = data.fft_spectrum(task.settings.replace(window="boxcar", tapers=1))

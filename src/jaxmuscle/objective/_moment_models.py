@@ -29,8 +29,9 @@ def welch_operator(
 ) -> Float[np.ndarray, "parts samples"]:
     """The linear part of `spectrum_of` as one matrix.
 
-    Low-pass, window, detrending, taper and transform are linear, so a Welch power is `Σ (A x)²` over the rows of its
-    bin; the rows are ordered (segments, tapers and real/imaginary part, bins), scaled so that the sum is the power itself.
+    Low-pass, window, detrending, taper and transform are linear, so a Welch power is `Σ (A x)²`
+    over the rows of its bin; the rows are ordered (segments, tapers and real/imaginary part, bins),
+    scaled so that the sum is the power itself.
     """
     x = np.eye(samples)
     if settings.sections is not None:
@@ -40,7 +41,9 @@ def welch_operator(
     x = x[:, round(window[0] * settings.rate) : round(window[1] * settings.rate)]
     count, n = settings.segments(x.shape[1]), settings.length
     if count < 1:
-        raise ValueError(f"window {window} s is shorter than one segment of {n} samples at {settings.rate} Hz")
+        raise ValueError(
+            f"window {window} s is shorter than one segment of {n} samples at {settings.rate} Hz"
+        )
     rows = bin_rows(settings).swapaxes(0, 1) / np.sqrt(count)
     segments = [x[:, k * settings.step : k * settings.step + n].T for k in range(count)]
     each = [taper @ segment for segment in segments for taper in rows]
@@ -48,9 +51,11 @@ def welch_operator(
 
 
 class Linear(eqx.Module):
-    """The expected spectrum of a task in linear response, times a `correction` (of a nonlinear simulation, say).
+    """The expected spectrum of a task in linear response, times a `correction` (of a nonlinear
+    simulation, say).
 
-    Its variance is that of a recording of so many `samples`. `points`: frequencies of a measured dynamic stiffness [Hz].
+    Its variance is that of a recording of so many `samples`. `points`: frequencies of a measured
+    dynamic stiffness [Hz].
     """
 
     chosen: np.ndarray
@@ -60,7 +65,8 @@ class Linear(eqx.Module):
     points: Float[Array | np.ndarray, " points"] | None = None
 
     def compared(self, task: AbstractTask) -> Moments:
-        """Expected moments of the task's output that are compared with data: without rate and half-power frequency.
+        """Expected moments of the task's output that are compared with data: without rate and
+        half-power frequency.
 
         Those two have no second derivative.
         """
@@ -75,7 +81,9 @@ class Linear(eqx.Module):
     def _compared(self, task: AbstractTask) -> tuple[Moments, Linearisation]:
         # Compiled apart, so that it is traced once.
         found, system = expected_moments(task, task.settings, self.window, self.samples)
-        power, line, resonant = jax.tree.map(lambda x: x[self.chosen], (found.power, found.line, found.resonant))
+        power, line, resonant = jax.tree.map(
+            lambda x: x[self.chosen], (found.power, found.line, found.resonant)
+        )
         found = found._replace(power=power, line=line, resonant=resonant)
         if self.points is not None:
             found = found._replace(stiffness=parts_of_stiffness(task, system, self.points))
@@ -85,10 +93,12 @@ class Linear(eqx.Module):
 class MonteCarlo(eqx.Module):
     """Mean spectrum of a task over noise paths that stay the same (common random numbers).
 
-    They are drawn while the task is integrated, from the random numbers of each seed. With `control` the task starts settled
-    and the linearised task runs on the same paths as control variate. Without it the first of the seeds has no noise, which
-    gives the harmonic's own response; that is taken off every seed before the spectrum and its power added after: the
-    cross term between line and noise has expectation zero, yet for fixed paths it makes the cost ripple with the frequency.
+    They are drawn while the task is integrated, from the random numbers of each seed. With
+    `control` the task starts settled and the linearised task runs on the same paths as control
+    variate. Without it the first of the seeds has no noise, which gives the harmonic's own
+    response; that is taken off every seed before the spectrum and its power added after: the cross
+    term between line and noise has expectation zero, yet for fixed paths it makes the cost ripple
+    with the frequency.
     """
 
     streams: Stream
@@ -101,18 +111,40 @@ class MonteCarlo(eqx.Module):
     points: Float[Array | np.ndarray, " points"] | None = None
 
     @classmethod
-    def of(cls, settings: SpectrumSettings, key: PRNGKeyArray, seeds: int, grid: Grid, chosen: np.ndarray,
-           window: tuple[float, float], *, control: bool, draws: Draws = Draws(),  # noqa: B008
-           samples: int | None = None, points: Any = None) -> "MonteCarlo":  # fmt: skip
-        """On seeds 0 to `seeds - 1` of the key; `chosen` are the positions of the compared bins among the settings' bins.
+    def of(
+        cls,
+        settings: SpectrumSettings,
+        key: PRNGKeyArray,
+        seeds: int,
+        grid: Grid,
+        chosen: np.ndarray,
+        window: tuple[float, float],
+        *,
+        control: bool,
+        draws: Draws = Draws(),  # noqa: B008
+        samples: int | None = None,
+        points: Any = None,
+    ) -> "MonteCarlo":
+        """On seeds 0 to `seeds - 1` of the key; `chosen` are the positions of the compared bins
+        among the settings' bins.
 
-        With a control variate the variance is that of a recording of so many `samples`, by default as many as simulated.
+        With a control variate the variance is that of a recording of so many `samples`, by default
+        as many as simulated.
         """
         numbers = jnp.arange(seeds) if control else jnp.maximum(jnp.arange(seeds + 1) - 1, 0)
         streams = streams_of(key, numbers, draws)
         operator = welch_operator(settings, grid.steps // grid.every + 1, window)
         samples = samples_in(window, settings) if samples is None else samples
-        return cls(streams, jnp.asarray(operator), chosen, jnp.asarray(samples), grid, window, control, points)
+        return cls(
+            streams,
+            jnp.asarray(operator),
+            chosen,
+            jnp.asarray(samples),
+            grid,
+            window,
+            control,
+            points,
+        )
 
     @property
     def seeds(self) -> int:
@@ -121,13 +153,16 @@ class MonteCarlo(eqx.Module):
 
     def moments(self, task: AbstractTask) -> Moments:
         """Moments of the task's output."""
-        from jaxmuscle.simulation._integrator import integrated  # and diffrax, which a linear fit does without
+        # and diffrax, which a linear fit does without
+        from jaxmuscle.simulation._integrator import integrated
 
         settings = task.settings
         start, stop = (round(edge * settings.rate) for edge in self.window)
 
         def outputs(loud, *tasks):
-            return integrated(tasks, self.streams, self.grid, settings.sampling, states=False, loud=loud).outputs
+            return integrated(
+                tasks, self.streams, self.grid, settings.sampling, states=False, loud=loud
+            ).outputs
 
         def swing(seen):
             return jnp.var(lowpass(seen, settings)[..., start:stop], axis=-1)
@@ -136,22 +171,43 @@ class MonteCarlo(eqx.Module):
             task = settled(task)
             exact, system = response(task, settings, self.window, self.samples)
             seen, beside = outputs(None, task, LinearTask.of(task, system))
-            power = exact.power[self.chosen] + jnp.mean(self._power(seen, settings) - self._power(beside, settings), 0)
+            power = exact.power[self.chosen] + jnp.mean(
+                self._power(seen, settings) - self._power(beside, settings), 0
+            )
             mean, spread = jnp.mean(seen[:, start:stop]), jnp.mean(swing(seen) - swing(beside))
             resonant = tuple(own[self.chosen] for own in exact.resonant)
             half = half_power_frequency(task, system)
             stiffness = () if self.points is None else parts_of_stiffness(task, system, self.points)
-            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread, slowest(system.A), half, resonant,
-                           stiffness)  # fmt: skip
+            return Moments(
+                power,
+                exact.line[self.chosen],
+                mean,
+                exact.variance + spread,
+                slowest(system.A),
+                half,
+                resonant,
+                stiffness,
+            )
         (seen,) = outputs(jnp.minimum(jnp.arange(self.seeds + 1.0), 1.0), task)
         mean = jnp.mean(seen[1:, start:stop])
         quiet, noisy = seen[:1], seen[1:] - seen[:1]
-        line, random = jnp.mean(self._power(quiet, settings), 0), jnp.mean(self._power(noisy, settings), 0)
+        line, random = (
+            jnp.mean(self._power(quiet, settings), 0),
+            jnp.mean(self._power(noisy, settings), 0),
+        )
         variance = swing(quiet[0]) + jnp.mean(swing(noisy))
-        none = tuple(jnp.full_like(line, jnp.nan) for part in task.noise.components if isinstance(part, ResonantNoise))
-        return Moments(line + random, line, mean, variance, slowest_rate(task), jnp.full((), jnp.nan), none)
+        none = tuple(
+            jnp.full_like(line, jnp.nan)
+            for part in task.noise.components
+            if isinstance(part, ResonantNoise)
+        )
+        return Moments(
+            line + random, line, mean, variance, slowest_rate(task), jnp.full((), jnp.nan), none
+        )
 
-    def _power(self, outputs: Float[Array, "seeds samples"], settings: SpectrumSettings) -> Float[Array, "seeds bins"]:
+    def _power(
+        self, outputs: Float[Array, "seeds samples"], settings: SpectrumSettings
+    ) -> Float[Array, "seeds bins"]:
         bins = settings.last_bin - settings.first_bin + 1
         parts = (outputs @ self.operator.T).reshape(len(outputs), -1, bins)
         return jnp.sum(parts**2, axis=1)[:, self.chosen]

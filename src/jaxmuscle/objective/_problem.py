@@ -1,4 +1,5 @@
-"""The problem of a fit: its targets with their tasks, the coordinates that they share, and the residuals that follow."""
+"""The problem of a fit: its targets with their tasks, the coordinates that they share, and the
+residuals that follow."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -33,9 +34,10 @@ MOST_SUBSTEPS = 16
 def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[Any, Any] | None:
     """Log coefficient of variation of a target and its standard deviation.
 
-    With a task and where the target states its segments: `log_variation_sd` of recordings that give so many. Else half the
-    relative error of the power in the bins, `½ √(pᵀ V p)` with V the covariance of the log powers, which is too much where
-    power lies elsewhere or in a harmonic. The `mean_error` of several trials where their scatter is larger.
+    With a task and where the target states its segments: `log_variation_sd` of recordings that give
+    so many. Else half the relative error of the power in the bins, `½ √(pᵀ V p)` with V the
+    covariance of the log powers, which is too much where power lies elsewhere or in a harmonic. The
+    `mean_error` of several trials where their scatter is larger.
     """
     values = target.coefficient_of_variation
     if values is None:
@@ -54,9 +56,11 @@ def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One target of a fit: its task, the task's free coordinates, and which `columns` of the fit's coordinates they are.
+    """One target of a fit: its task, the task's free coordinates, and which `columns` of the fit's
+    coordinates they are.
 
-    `variation` and `mean`: (log) coefficient of variation and mean with their standard deviations, None where not fitted.
+    `variation` and `mean`: (log) coefficient of variation and mean with their standard deviations,
+    None where not fitted.
     """
 
     name: str
@@ -93,23 +97,35 @@ class Part:
     @property
     def points(self) -> Float[np.ndarray, " points"] | None:
         """Frequencies of the target's dynamic stiffness [Hz]."""
-        return None if self.target.stiffness is None else np.asarray(self.target.stiffness.known.frequency)
+        return (
+            None
+            if self.target.stiffness is None
+            else np.asarray(self.target.stiffness.known.frequency)
+        )
 
     @property
     def ones(self) -> Moments:
         """The correction of moments that changes nothing."""
         ones, one = np.ones(len(self.chosen)), np.ones(())
-        resonant = tuple(ones for noise in self.task.noise.components if isinstance(noise, ResonantNoise))
+        resonant = tuple(
+            ones for noise in self.task.noise.components if isinstance(noise, ResonantNoise)
+        )
         stiffness = () if self.points is None else np.ones((2, len(self.points)))
         return Moments(ones, ones, one, one, one, one, resonant, stiffness)
 
-    def linear(self, residual: str, share: np.ndarray | None = None, correction: Moments | None = None) -> PartResiduals:
+    def linear(
+        self, residual: str, share: np.ndarray | None = None, correction: Moments | None = None
+    ) -> PartResiduals:
         """Its residuals in linear response, times a correction of its moments."""
         known: Moments = jax.tree.map(np.asarray, self.ones if correction is None else correction)
         samples = np.asarray(trial_samples(self.target))
-        return self.residuals(Linear(self.chosen, known, samples, WINDOW, self.points), residual, share)
+        return self.residuals(
+            Linear(self.chosen, known, samples, WINDOW, self.points), residual, share
+        )
 
-    def residuals(self, model: Linear | MonteCarlo, residual: str, share: np.ndarray | None) -> PartResiduals:
+    def residuals(
+        self, model: Linear | MonteCarlo, residual: str, share: np.ndarray | None
+    ) -> PartResiduals:
         """Its residuals with a model of its moments; `share` is what a line holds of each bin."""
         statistics = bin_statistics(self.target, share)
         sigma = residual_sigma(residual, self.target, statistics)
@@ -120,15 +136,18 @@ class Part:
         spectrum = self.target.proportional_power, statistics.bias, statistics.sd, sigma
         data = Data(*spectrum, self.variation, self.mean, stiffness)
         given = as_arrays({"data": data, "statistics": statistics})
-        return PartResiduals(as_arrays(self.task), self.coordinates, model, **given, residual=residual)
+        return PartResiduals(
+            as_arrays(self.task), self.coordinates, model, **given, residual=residual
+        )
 
 
 @dataclasses.dataclass(frozen=True)
 class FitProblem:
-    """What a fit is about, its arguments checked: one target, or several of one person with what they share.
+    """What a fit is about, its arguments checked: one target, or several of one person with what
+    they share.
 
-    `control`: whether all tasks have a linear response; `optimiser`, which makes the steps (None: Levenberg-Marquardt);
-    `draws`, which random numbers what is simulated for expectations takes.
+    `control`: whether all tasks have a linear response; `optimiser`, which makes the steps (None:
+    Levenberg-Marquardt); `draws`, which random numbers what is simulated for expectations takes.
     """
 
     parts: tuple[Part, ...]
@@ -145,10 +164,14 @@ class FitProblem:
     draws: Draws = Draws()  # noqa: RUF009
 
     @classmethod
-    def shared(cls, problems: "Mapping[str, FitProblem]", names: Mapping[str, Mapping[str, str]]) -> "FitProblem":
-        """From the problems of the targets alone and the joint name of each one's parameters, as `joint_names` gives them.
+    def shared(
+        cls, problems: "Mapping[str, FitProblem]", names: Mapping[str, Mapping[str, str]]
+    ) -> "FitProblem":
+        """From the problems of the targets alone and the joint name of each one's parameters, as
+        `joint_names` gives them.
 
-        A coordinate that is shared is that of the first target: θ = 0 is the task's own value in every one.
+        A coordinate that is shared is that of the first target: θ = 0 is the task's own value in
+        every one.
         """
         places: dict[str, tuple[FitProblem, int]] = {}
         for target, problem in problems.items():
@@ -157,19 +180,29 @@ class FitProblem:
         order = {name: i for i, name in enumerate(places)}
 
         def gathered(field: str) -> np.ndarray:
-            return np.array([getattr(problem.coordinates, field)[i] for problem, i in places.values()])
+            return np.array(
+                [getattr(problem.coordinates, field)[i] for problem, i in places.values()]
+            )
 
         fields = (gathered(field) for field in ("centre", "sd", "positive", "low", "high"))
-        parts = tuple(dataclasses.replace(p.parts[0], name=t, columns=tuple(order[names[t][n]] for n in p.coordinates.names))
-                      for t, p in problems.items())  # fmt: skip
+        parts = tuple(
+            dataclasses.replace(
+                p.parts[0], name=t, columns=tuple(order[names[t][n]] for n in p.coordinates.names)
+            )
+            for t, p in problems.items()
+        )
         prior = np.array([problem.prior[i] for problem, i in places.values()])
         first = next(iter(problems.values()))
-        return dataclasses.replace(first, parts=parts, coordinates=Coordinates(tuple(places), *fields), prior=prior)
+        return dataclasses.replace(
+            first, parts=parts, coordinates=Coordinates(tuple(places), *fields), prior=prior
+        )
 
     @property
     def finest(self) -> Target:
         """The target whose bins are narrowest."""
-        return min((part.target for part in self.parts), key=lambda target: target.settings.resolution)
+        return min(
+            (part.target for part in self.parts), key=lambda target: target.settings.resolution
+        )
 
     @property
     def title(self) -> str:
@@ -178,7 +211,8 @@ class FitProblem:
 
     @property
     def steps_per_sample(self) -> int:
-        """Steps of the noise grid per sampling interval. Raises `ValueError` if dt does not fit it."""
+        """Steps of the noise grid per sampling interval. Raises `ValueError` if dt does not fit
+        it."""
         settings = self.parts[0].target.settings
         return steps_per_sample(settings.rate, self.dt, settings.sampling)
 
@@ -199,7 +233,8 @@ class FitProblem:
         return tuple(part for part in self.parts if column in part.columns)
 
     def where(self, name: str) -> tuple[int, str]:
-        """Which part a quantity "name@part" is of, and its name there; of one that belongs to all, the first."""
+        """Which part a quantity "name@part" is of, and its name there; of one that belongs to all,
+        the first."""
         base, _, target = name.partition("@")
         names = [part.name for part in self.parts]
         return (names.index(target) if target else 0), base
@@ -208,60 +243,97 @@ class FitProblem:
         """A table of each part as one: with several parts, names become "name@part"."""
         if len(self.parts) == 1:
             return dict(tables[0])
-        return {f"{n}@{part.name}": x for part, table in zip(self.parts, tables, strict=True) for n, x in table.items()}
+        return {
+            f"{n}@{part.name}": x
+            for part, table in zip(self.parts, tables, strict=True)
+            for n, x in table.items()
+        }
 
     def scattering_as(self, tasks: Sequence[AbstractTask]) -> "FitProblem":
         """The problem with coefficients of variation that scatter as those of these tasks do."""
-        parts = tuple(part.scattering_as(task) for part, task in zip(self.parts, tasks, strict=True))
+        parts = tuple(
+            part.scattering_as(task) for part, task in zip(self.parts, tasks, strict=True)
+        )
         return dataclasses.replace(self, parts=parts)
 
     def linear(
-        self, shares: Sequence[np.ndarray | None] | None = None, corrections: Sequence[Moments | None] | None = None
+        self,
+        shares: Sequence[np.ndarray | None] | None = None,
+        corrections: Sequence[Moments | None] | None = None,
     ) -> Residuals:
-        """Its residuals in linear response; of each part the line's share of the bins and a correction, if known."""
+        """Its residuals in linear response; of each part the line's share of the bins and a
+        correction, if known."""
         none = [None] * len(self.parts)
         given = zip(self.parts, shares or none, corrections or none, strict=True)
-        return self._residuals(part.linear(self.residual, share, correction) for part, share, correction in given)
+        return self._residuals(
+            part.linear(self.residual, share, correction) for part, share, correction in given
+        )
 
     def montecarlo(self, seeds: int, shares: Sequence[np.ndarray] | None = None) -> Residuals:
         """Its residuals on the first `seeds` noise paths."""
         given = zip(self.parts, shares or [None] * len(self.parts), strict=True)
-        return self._residuals(part.residuals(self._paths(part, seeds), self.residual, share) for part, share in given)
+        return self._residuals(
+            part.residuals(self._paths(part, seeds), self.residual, share) for part, share in given
+        )
 
     def _residuals(self, parts: Any) -> Residuals:
         free = as_arrays({"prior": self.prior, "moving": np.ones(len(self.prior))})
-        return Residuals(tuple(parts), self.coordinates, **free, columns=tuple(part.columns for part in self.parts),
-                         optimiser=self.optimiser)  # fmt: skip
+        return Residuals(
+            tuple(parts),
+            self.coordinates,
+            **free,
+            columns=tuple(part.columns for part in self.parts),
+            optimiser=self.optimiser,
+        )
 
     def _paths(self, part: Part, seeds: int) -> MonteCarlo:
         settings, every = part.target.settings, self.steps_per_sample
         part.task.check_step(self.dt)
         grid = Grid(self.dt, every * round(DURATION * settings.rate), every, 1, reverse=False)
-        return MonteCarlo.of(settings, jax.random.fold_in(self.key, 0), seeds, grid, part.chosen, WINDOW,
-                             control=self.control, draws=self.draws, samples=trial_samples(part.target),
-                             points=part.points)  # fmt: skip
+        return MonteCarlo.of(
+            settings,
+            jax.random.fold_in(self.key, 0),
+            seeds,
+            grid,
+            part.chosen,
+            WINDOW,
+            control=self.control,
+            draws=self.draws,
+            samples=trial_samples(part.target),
+            points=part.points,
+        )
 
     def finer(self, objective: Residuals, points: Float[np.ndarray, "points free"]) -> Residuals:
-        """The residuals with as many sub-steps as the stiffest of the points asks for; never fewer than they have."""
+        """The residuals with as many sub-steps as the stiffest of the points asks for; never fewer
+        than they have."""
         if objective.linear:
             return objective
         theta = np.asarray(self.coordinates.theta(points))
         for i, part in enumerate(self.parts):
             rates = [_rate(part, row) for row in theta]
             fastest = max((rate for rate in rates if np.isfinite(rate)), default=0.0)
-            needed = min(2 ** int(np.ceil(np.log2(max(fastest * self.dt / MAX_RATE_STEP, 1.0)))), MOST_SUBSTEPS)
+            needed = min(
+                2 ** int(np.ceil(np.log2(max(fastest * self.dt / MAX_RATE_STEP, 1.0)))),
+                MOST_SUBSTEPS,
+            )
             model = objective.parts[i].model
             assert isinstance(model, MonteCarlo)
             grid = model.grid
             if needed > grid.substeps:
                 grid = Grid(grid.dt, grid.steps, grid.every, needed, reverse=False)
-                objective = eqx.tree_at(lambda o, i=i: o.parts[i].model.grid, objective, grid,
-                                        is_leaf=lambda x: isinstance(x, Grid))  # fmt: skip
+                objective = eqx.tree_at(
+                    lambda o, i=i: o.parts[i].model.grid,
+                    objective,
+                    grid,
+                    is_leaf=lambda x: isinstance(x, Grid),
+                )
         return objective
 
 
 def _rate(part: Part, theta: Float[np.ndarray, " free"]) -> float:
     try:
-        return fastest_rate(task_at(as_arrays(part.task), part.coordinates, jnp.asarray(part.own(theta))), DURATION)
+        return fastest_rate(
+            task_at(as_arrays(part.task), part.coordinates, jnp.asarray(part.own(theta))), DURATION
+        )
     except ValueError:
         return np.nan

@@ -1,4 +1,5 @@
-"""The residuals of a fit: what each target and the prior contribute, of one target or of several."""
+"""The residuals of a fit: what each target and the prior contribute, of one target or of
+several."""
 
 from typing import Any
 
@@ -19,8 +20,8 @@ from ._moment_models import Linear, MonteCarlo
 
 
 class Data(eqx.Module):
-    """What a fit knows of a target: powers, their spread; log coefficient of variation, mean, and real and imaginary part of
-    the dynamic stiffness, each with its sd (or None).
+    """What a fit knows of a target: powers, their spread; log coefficient of variation, mean, and
+    real and imaginary part of the dynamic stiffness, each with its sd (or None).
 
     The model does not depend on it.
     """
@@ -31,7 +32,12 @@ class Data(eqx.Module):
     sigma: Float[Array | np.ndarray, "*rows bins"]
     variation: tuple[Scalar, Scalar] | None
     mean: tuple[Scalar, Scalar] | None
-    stiffness: tuple[Float[Array | np.ndarray, "*rows 2 points"], Float[Array | np.ndarray, "*rows points"]] | None = None
+    stiffness: (
+        tuple[
+            Float[Array | np.ndarray, "*rows 2 points"], Float[Array | np.ndarray, "*rows points"]
+        ]
+        | None
+    ) = None
 
     @property
     def further(self) -> int:
@@ -56,9 +62,13 @@ class PartResiduals(eqx.Module):
 
     def data_residuals(self, moments: Moments, data: Data) -> Float[Array, " residuals"]:
         """Residuals in standard deviations of the data: spectrum, then the further ones."""
-        return jnp.concatenate([jnp.asarray(self._spectrum_residuals(moments, data)), further_residuals(moments, data)])
+        return jnp.concatenate(
+            [jnp.asarray(self._spectrum_residuals(moments, data)), further_residuals(moments, data)]
+        )
 
-    def _spectrum_residuals(self, moments: Moments, data: Data) -> Float[Array | np.ndarray, " bins"]:
+    def _spectrum_residuals(
+        self, moments: Moments, data: Data
+    ) -> Float[Array | np.ndarray, " bins"]:
         if self.residual == "log":
             z = jnp.log(data.target) - data.bias - jnp.log(moments.power)
             return (z - jnp.mean(z)) / data.sd
@@ -70,20 +80,27 @@ class PartResiduals(eqx.Module):
 
 def further_residuals(moments: Moments, data: Data) -> Float[Array, " rows"]:
     """Residuals of coefficient of variation, mean and dynamic stiffness, where there are such."""
-    rows = [] if data.variation is None else [(jnp.log(moments.variation) - data.variation[0]) / data.variation[1]]
+    rows = (
+        []
+        if data.variation is None
+        else [(jnp.log(moments.variation) - data.variation[0]) / data.variation[1]]
+    )
     rows += [] if data.mean is None else [(moments.mean - data.mean[0]) / data.mean[1]]
     found = jnp.stack([jnp.asarray(row) for row in rows]) if rows else jnp.zeros(0)
     if data.stiffness is None:
         return found
     measured, sd = data.stiffness
-    return jnp.concatenate([found, jnp.reshape((jnp.asarray(moments.stiffness) - measured) / sd, -1)])
+    return jnp.concatenate(
+        [found, jnp.reshape((jnp.asarray(moments.stiffness) - measured) / sd, -1)]
+    )
 
 
 class Residuals(eqx.Module):
     """Everything that the residuals of a fit depend on besides the free coordinates.
 
-    Of one target or of several: `columns` says of every part where its own coordinates stand among those of the fit. Moments
-    and data are tuples, one entry for each part. `optimiser` makes the steps that lower them (None: Levenberg-Marquardt).
+    Of one target or of several: `columns` says of every part where its own coordinates stand among
+    those of the fit. Moments and data are tuples, one entry for each part. `optimiser` makes the
+    steps that lower them (None: Levenberg-Marquardt).
     """
 
     parts: tuple[PartResiduals, ...]
@@ -103,15 +120,22 @@ class Residuals(eqx.Module):
         """Data of every part."""
         return tuple(part.data for part in self.parts)
 
-    def theta(self, s: Float[Array | np.ndarray, "*rows free"]) -> Float[Array | np.ndarray, "*rows free"]:
-        """Coordinates in prior standard deviations; what is not `moving` (1, else 0) has no slope."""
+    def theta(
+        self, s: Float[Array | np.ndarray, "*rows free"]
+    ) -> Float[Array | np.ndarray, "*rows free"]:
+        """Coordinates in prior standard deviations; what is not `moving` (1, else 0) has no
+        slope."""
         if not isinstance(s, np.ndarray):
             s = jnp.where(self.moving > 0, s, jax.lax.stop_gradient(s))
         return self.coordinates.theta(s)
 
-    def data_residuals(self, moments: tuple[Moments, ...], data: tuple[Data, ...]) -> Float[Array, " residuals"]:
+    def data_residuals(
+        self, moments: tuple[Moments, ...], data: tuple[Data, ...]
+    ) -> Float[Array, " residuals"]:
         """Data residuals of all parts, one after the other."""
-        return jnp.concatenate([p.data_residuals(m, d) for p, m, d in zip(self.parts, moments, data, strict=True)])
+        return jnp.concatenate(
+            [p.data_residuals(m, d) for p, m, d in zip(self.parts, moments, data, strict=True)]
+        )
 
     def residuals(
         self, theta: Float[Array, " free"], moments: tuple[Moments, ...], data: tuple[Data, ...]
@@ -119,19 +143,26 @@ class Residuals(eqx.Module):
         """Data residuals of the moments at θ, then those of the prior, which counts once."""
         return jnp.concatenate([self.data_residuals(moments, data), jnp.sqrt(self.prior) * theta])
 
-    def own(self, values: Float[Array | np.ndarray, "*rows free"], i: int) -> Float[Array | np.ndarray, "*rows own"]:
+    def own(
+        self, values: Float[Array | np.ndarray, "*rows free"], i: int
+    ) -> Float[Array | np.ndarray, "*rows own"]:
         """One part's columns of θ, or of slopes with respect to it."""
         return values[..., np.array(self.columns[i], dtype=int)]
 
-    def spread(self, slope: Float[np.ndarray, "*rows own"], i: int) -> Float[np.ndarray, "*rows free"]:
+    def spread(
+        self, slope: Float[np.ndarray, "*rows own"], i: int
+    ) -> Float[np.ndarray, "*rows free"]:
         """Slopes with respect to one part's coordinates as slopes with respect to all."""
         whole = np.zeros((*np.shape(slope)[:-1], len(self.coordinates.names)))
         whole[..., np.array(self.columns[i], dtype=int)] = slope
         return whole
 
 
-def residual_sigma(kind: str, target: Target, statistics: BinStatistics) -> Float[np.ndarray, " bins"]:
-    """What the linear and the cumulative residual are divided by: standard deviations of p_k or of its running sum."""
+def residual_sigma(
+    kind: str, target: Target, statistics: BinStatistics
+) -> Float[np.ndarray, " bins"]:
+    """What the linear and the cumulative residual are divided by: standard deviations of p_k or of
+    its running sum."""
     p = target.proportional_power
     if kind == "linear" and target.sigma is not None and target.segments is None:
         return np.asarray(target.sigma)

@@ -1,4 +1,5 @@
-"""The maximum of a likelihood, or of a posterior, from many points at once, by damped Fisher scoring."""
+"""The maximum of a likelihood, or of a posterior, from many points at once, by damped Fisher
+scoring."""
 
 from typing import Any, NamedTuple
 
@@ -22,9 +23,11 @@ HARDEST = 1e9
 
 
 class Maximum(NamedTuple):
-    """Where each row ended: θ, offsets, log likelihood (with these maximised), what was minimised, and its curvature.
+    """Where each row ended: θ, offsets, log likelihood (with these maximised), what was minimised,
+    and its curvature.
 
-    `curvature` is the Fisher information of θ and the offsets, with the prior's precision on its diagonal.
+    `curvature` is the Fisher information of θ and the offsets, with the prior's precision on its
+    diagonal.
     """
 
     theta: Float[np.ndarray, "rows free"]
@@ -50,7 +53,8 @@ class Maximum(NamedTuple):
 
 
 class Pin(NamedTuple):
-    """A derived quantity q of one part (with `log` its logarithm) held near `value` by `½ ((q - value) / width)²`.
+    """A derived quantity q of one part (with `log` its logarithm) held near `value` by `½ ((q -
+    value) / width)²`.
 
     A value per row.
     """
@@ -70,8 +74,11 @@ class Pin(NamedTuple):
 
 
 @kept
-def _local(likelihood: Likelihood, bins: AllBins, seen: Expansion, offset: Array) -> tuple[Array, Array, Array]:
-    """Log likelihood, its gradient and its Fisher information with respect to (θ, offsets), for every row."""
+def _local(
+    likelihood: Likelihood, bins: AllBins, seen: Expansion, offset: Array
+) -> tuple[Array, Array, Array]:
+    """Log likelihood, its gradient and its Fisher information with respect to (θ, offsets), for
+    every row."""
     free = seen.theta.shape[-1]
 
     def one(bins, seen, offset):
@@ -95,16 +102,19 @@ def maximise(
     pin: Pin | None = None,
     max_steps: int = STEPS,
 ) -> Maximum:
-    """Minimise `-ln L(θ, u) + ½ Σ precision θ²` from every row, u the offsets; `moving` is 0 where a coordinate stays.
+    """Minimise `-ln L(θ, u) + ½ Σ precision θ²` from every row, u the offsets; `moving` is 0 where
+    a coordinate stays.
 
-    `bins` has a leading axis of rows: each may have data of its own. Steps `-(F + λ diag F)⁻¹ g` in the unbounded
-    coordinates, F the Fisher information, λ lowered after accepted steps and raised after rejected ones. A row has settled
-    when an accepted step gains less than 1e-5.
+    `bins` has a leading axis of rows: each may have data of its own. Steps `-(F + λ diag F)⁻¹ g` in
+    the unbounded coordinates, F the Fisher information, λ lowered after accepted steps and raised
+    after rejected ones. A row has settled when an accepted step gains less than 1e-5.
     """
     coordinates, rows = likelihood.objective.coordinates, len(theta)
     moving = np.ones_like(theta) if moving is None else moving
     if bins is None:
-        bins = tuple(jax.tree.map(lambda x: np.broadcast_to(x, (rows, *np.shape(x))), likelihood.bins))
+        bins = tuple(
+            jax.tree.map(lambda x: np.broadcast_to(x, (rows, *np.shape(x))), likelihood.bins)
+        )
     s, u, damping = coordinates.from_theta(theta), np.zeros((rows, len(bins))), np.full(rows, 1e-2)
     here = _look(likelihood, bins, s, u, precision, pin)
     settled, active = np.zeros(rows, dtype=bool), np.isfinite(here.cost)
@@ -129,7 +139,9 @@ def maximise(
         # Refused although the step was short: at the maximum to rounding.
         settled[which] |= ~better & (np.max(np.abs(step), axis=1) < 1e-7)
         active[which] = ~settled[which] & (damping[which] < HARDEST)
-    return Maximum(np.asarray(coordinates.theta(s)), u, here.height, here.cost, here.information, settled)
+    return Maximum(
+        np.asarray(coordinates.theta(s)), u, here.height, here.cost, here.information, settled
+    )
 
 
 class _Look(NamedTuple):
@@ -139,8 +151,14 @@ class _Look(NamedTuple):
     information: np.ndarray
 
 
-def _look(likelihood: Likelihood, bins: AllBins, s: np.ndarray, u: np.ndarray, precision: np.ndarray,
-          pin: Pin | None) -> _Look:  # fmt: skip
+def _look(
+    likelihood: Likelihood,
+    bins: AllBins,
+    s: np.ndarray,
+    u: np.ndarray,
+    precision: np.ndarray,
+    pin: Pin | None,
+) -> _Look:
     """Cost, its slope and curvature with respect to (θ, u), where it is finite."""
     theta = np.asarray(likelihood.objective.coordinates.theta(s))
     seen = expand(likelihood.objective, theta)
@@ -162,7 +180,9 @@ def _look(likelihood: Likelihood, bins: AllBins, s: np.ndarray, u: np.ndarray, p
     return _Look(height, cost, slope, information)
 
 
-def _padded(likelihood: Likelihood, bins: AllBins, seen: Expansion, u: np.ndarray) -> tuple[Any, ...]:
+def _padded(
+    likelihood: Likelihood, bins: AllBins, seen: Expansion, u: np.ndarray
+) -> tuple[Any, ...]:
     return (likelihood, *_filled((bins, seen, u), len(u)))
 
 
@@ -173,22 +193,36 @@ def _filled(tree: Any, rows: int) -> Any:
     return jax.tree.map(lambda x: np.asarray(x)[last], tree)
 
 
-def _steps(here: _Look, coordinates: Coordinates, s: np.ndarray, moving: np.ndarray, damping: np.ndarray,
-           which: np.ndarray) -> np.ndarray:  # fmt: skip
+def _steps(
+    here: _Look,
+    coordinates: Coordinates,
+    s: np.ndarray,
+    moving: np.ndarray,
+    damping: np.ndarray,
+    which: np.ndarray,
+) -> np.ndarray:
     """Damped Newton steps in the unbounded coordinates and the offsets."""
     offsets = here.slope.shape[1] - s.shape[1]
-    stretch = np.concatenate([coordinates.stretch(s[which]) * moving[which], np.ones((len(which), offsets))], axis=1)
+    stretch = np.concatenate(
+        [coordinates.stretch(s[which]) * moving[which], np.ones((len(which), offsets))], axis=1
+    )
     slope = here.slope[which] * stretch
     curvature = here.information[which] * stretch[:, :, None] * stretch[:, None, :]
     size = np.maximum(np.diagonal(curvature, axis1=1, axis2=2), 1e-8)
     still = stretch == 0
-    curvature = curvature + np.eye(size.shape[1]) * np.where(still, 1.0, damping[which][:, None] * size + 1e-12)[:, None, :]
+    curvature = (
+        curvature
+        + np.eye(size.shape[1])
+        * np.where(still, 1.0, damping[which][:, None] * size + 1e-12)[:, None, :]
+    )
     step = -np.linalg.solve(curvature, slope[:, :, None])[:, :, 0]
     longest = np.max(np.abs(step), axis=1, keepdims=True)
     return step * np.minimum(1.0, 2.0 / np.maximum(longest, 1e-300))
 
 
-def highest(problem: FitProblem, likelihood: Likelihood, theta: np.ndarray, precision: np.ndarray) -> tuple[Maximum, int]:
+def highest(
+    problem: FitProblem, likelihood: Likelihood, theta: np.ndarray, precision: np.ndarray
+) -> tuple[Maximum, int]:
     """Maxima climbed to from `points_about`, and which of them is the highest."""
     peak = maximise(likelihood, points_about(problem, theta), precision)
     if not np.isfinite(peak.cost[peak.best]):

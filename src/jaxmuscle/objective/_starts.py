@@ -18,18 +18,24 @@ from ._residuals import Data, Residuals
 
 RANGE = 30.0  # of stiffness and damping, about the default
 RESPONSE = ("k_w", "k_z", "c_w", "c_z", "m_w", "m_z", "P_w")
-MOST, STEPS = 8, 25  # starts that begin at the measured response, and steps that are made to find them
-SEARCHES, AGREEING, SAME, BEHIND = (10, 22), 4, 0.1, 10.0  # by the response alone: how many, how many must agree, to which
+# starts that begin at the measured response, and steps that are made to find them
+MOST, STEPS = 8, 25
+# by the response alone: how many, how many must agree, to which
+SEARCHES, AGREEING, SAME, BEHIND = (10, 22), 4, 0.1, 10.0
 # difference of their costs, and how far above the best one a search ends if it gains little
 UNKNOWN = 1e6  # standard deviation of a log power that is not to count
 
 
-def starting_points(problem: FitProblem, count: int, *, alone: bool = True) -> Float[np.ndarray, "starts free"]:
-    """Starts: harmonic frequencies at the targets' local maxima and spread over their band, the rest space-filling.
+def starting_points(
+    problem: FitProblem, count: int, *, alone: bool = True
+) -> Float[np.ndarray, "starts free"]:
+    """Starts: harmonic frequencies at the targets' local maxima and spread over their band, the
+    rest space-filling.
 
-    The first start has all other parameters at their default, the others at half a prior standard deviation about it. With
-    several frequencies which of their candidates meet is left to chance; `recombined` tries the rest. Of a moved record some
-    begin at the muscle that its response alone asks for, unless `alone` is False, which saves the time of that search.
+    The first start has all other parameters at their default, the others at half a prior standard
+    deviation about it. With several frequencies which of their candidates meet is left to chance;
+    `recombined` tries the rest. Of a moved record some begin at the muscle that its response alone
+    asks for, unless `alone` is False, which saves the time of that search.
     """
     coordinates = problem.coordinates
     theta = space_filling(len(coordinates.names), count)
@@ -46,8 +52,11 @@ def starting_points(problem: FitProblem, count: int, *, alone: bool = True) -> F
     return coordinates.from_theta(theta)
 
 
-def continued(problem: FitProblem, count: int, known: Mapping[str, float]) -> Float[np.ndarray, "starts free"]:
-    """Starts of a richer model: in two thirds of them what it shares with a poorer one begins where that ended (`known`)."""
+def continued(
+    problem: FitProblem, count: int, known: Mapping[str, float]
+) -> Float[np.ndarray, "starts free"]:
+    """Starts of a richer model: in two thirds of them what it shares with a poorer one begins where
+    that ended (`known`)."""
     points = np.array(problem.coordinates.theta(starting_points(problem, count)))
     for column, name in enumerate(problem.coordinates.names):
         if name in known and problem.coordinates.positive[column]:
@@ -56,21 +65,33 @@ def continued(problem: FitProblem, count: int, known: Mapping[str, float]) -> Fl
 
 
 def _spread_resonances(problem: FitProblem, theta: Float[np.ndarray, "starts free"]) -> None:
-    """Every other start has its resonances at candidates of the target; of two the first is the higher one."""
+    """Every other start has its resonances at candidates of the target; of two the first is the
+    higher one."""
     names, rows = problem.coordinates.names, np.arange(1, len(theta), 2)
-    of = [name.partition("_frequency")[2] for name in names if name.startswith("resonance_frequency")]
+    of = [
+        name.partition("_frequency")[2] for name in names if name.startswith("resonance_frequency")
+    ]
     for target in of if len(rows) else ():
-        pair = [n for n in (f"resonance_frequency{target}", f"resonance_2_frequency{target}") if n in names]
-        each = [np.random.default_rng(i).permutation(frequencies_for(problem, n, len(rows))) for i, n in enumerate(pair)]
+        pair = [
+            n
+            for n in (f"resonance_frequency{target}", f"resonance_2_frequency{target}")
+            if n in names
+        ]
+        each = [
+            np.random.default_rng(i).permutation(frequencies_for(problem, n, len(rows)))
+            for i, n in enumerate(pair)
+        ]
         for name, frequencies in zip(pair, -np.sort(-np.stack(each), axis=0), strict=True):
             theta[rows, names.index(name)] = problem.coordinates.theta_of(name, frequencies)
 
 
 def _spread_coefficients(problem: FitProblem, theta: Float[np.ndarray, "starts free"]) -> None:
-    """Every other start has stiffness and damping up to `RANGE` times larger or smaller than by default.
+    """Every other start has stiffness and damping up to `RANGE` times larger or smaller than by
+    default.
 
-    A dynamic stiffness knows both, wherever they are: a person may well be ten times softer than the default muscle of the
-    same force, and from there a search finds its way only if it begins at the right order of magnitude.
+    A dynamic stiffness knows both, wherever they are: a person may well be ten times softer than
+    the default muscle of the same force, and from there a search finds its way only if it begins at
+    the right order of magnitude.
     """
     names, rows = problem.coordinates.names, np.arange(1, len(theta), 2)
     factors = math.log(RANGE) * (2 * halton(2, len(rows)) - 1)
@@ -79,16 +100,21 @@ def _spread_coefficients(problem: FitProblem, theta: Float[np.ndarray, "starts f
             theta[rows, column] += factor / problem.coordinates.sd[column]
 
 
-def _on_response(problem: FitProblem, points: Float[np.ndarray, "starts free"]) -> Float[np.ndarray, "starts free"]:
-    """Some of the starts are found in two steps: the muscle by its response alone, then what makes it fluctuate.
+def _on_response(
+    problem: FitProblem, points: Float[np.ndarray, "starts free"]
+) -> Float[np.ndarray, "starts free"]:
+    """Some of the starts are found in two steps: the muscle by its response alone, then what makes
+    it fluctuate.
 
-    The fluctuations may have another origin than the model says. Then they pull a search that fits both at once into a
-    muscle that does neither. So every other start of the last third begins where the dynamic stiffness alone is fitted
-    best, and where beside this muscle the fluctuations are.
+    The fluctuations may have another origin than the model says. Then they pull a search that fits
+    both at once into a muscle that does neither. So every other start of the last third begins
+    where the dynamic stiffness alone is fitted best, and where beside this muscle the fluctuations
+    are.
     """
     rows = np.arange(2 * len(points) // 3, len(points))[::2][:MOST]
     answers = np.isin([name.partition("@")[0] for name in problem.coordinates.names], RESPONSE)
-    if not problem.control or not len(rows) or not np.any(answers):  # of an own muscle nobody knows which parameters answer
+    # of an own muscle nobody knows which parameters answer
+    if not problem.control or not len(rows) or not np.any(answers):
         return points
     objective = problem.linear()
     answer = _answering(problem, objective)
@@ -103,7 +129,8 @@ def _on_response(problem: FitProblem, points: Float[np.ndarray, "starts free"]) 
 
 
 def _answering(problem: FitProblem, objective: Residuals) -> Float[np.ndarray, " free"] | None:
-    """Where the dynamic stiffness alone is fitted best, of some searches and, unless these agree, of more."""
+    """Where the dynamic stiffness alone is fitted best, of some searches and, unless these agree,
+    of more."""
     spread = np.zeros((2 * sum(SEARCHES), len(problem.coordinates.names)))
     _spread_coefficients(problem, spread)
     starts = problem.coordinates.from_theta(spread[1::2])
@@ -111,7 +138,10 @@ def _answering(problem: FitProblem, objective: Residuals) -> Float[np.ndarray, "
     ends, cost = np.zeros((0, starts.shape[1])), np.zeros(0)
     for some in np.split(starts, np.cumsum(SEARCHES)[:-1]):
         found = least_squares(objective, some, STEPS, data=for_all(blind, len(some)), margin=BEHIND)
-        ends, cost = np.concatenate([ends, found.s]), np.append(cost, np.where(np.isfinite(found.cost), found.cost, np.inf))
+        ends, cost = (
+            np.concatenate([ends, found.s]),
+            np.append(cost, np.where(np.isfinite(found.cost), found.cost, np.inf)),
+        )
         if np.sum(cost < np.min(cost) + SAME) >= AGREEING:
             break
     return ends[np.argmin(cost)] if np.isfinite(np.min(cost)) else None
@@ -125,24 +155,32 @@ def _blind(data: Data) -> Data:
 
 
 def frequencies_for(problem: FitProblem, name: str, count: int) -> Float[np.ndarray, " starts"]:
-    """Candidates of the target that a harmonic frequency acts on; of several targets in turn, then over their band."""
+    """Candidates of the target that a harmonic frequency acts on; of several targets in turn, then
+    over their band."""
     targets = [part.target for part in problem.acting(name)]
     if len(problem.parts) == 1:
         return candidate_frequencies(targets[0], count)
     each = [candidate_frequencies(target, -(-count // len(targets))) for target in targets]
-    low, high = (edge(target.frequency[i] for target in targets) for edge, i in ((min, 0), (max, -1)))
+    low, high = (
+        edge(target.frequency[i] for target in targets) for edge, i in ((min, 0), (max, -1))
+    )
     found = np.concatenate([np.stack(each, axis=1).ravel(), np.geomspace(low, high, 2 * count)])
     _, first = np.unique(np.round(np.log(found), 3), return_index=True)
     return found[np.sort(first)[:count]]
 
 
-def recombined(problem: FitProblem, theta: Float[np.ndarray, " free"], count: int) -> list[Float[np.ndarray, "starts free"]]:
-    """Where several harmonic frequencies are free: further starts, a point with each of them in turn at its candidates."""
+def recombined(
+    problem: FitProblem, theta: Float[np.ndarray, " free"], count: int
+) -> list[Float[np.ndarray, "starts free"]]:
+    """Where several harmonic frequencies are free: further starts, a point with each of them in
+    turn at its candidates."""
     coordinates = problem.coordinates
     names, found = frequency_names(coordinates), []
     for name in names if len(names) > 1 else ():
         points = np.tile(theta, (count, 1))
-        points[:, coordinates.names.index(name)] = coordinates.theta_of(name, frequencies_for(problem, name, count))
+        points[:, coordinates.names.index(name)] = coordinates.theta_of(
+            name, frequencies_for(problem, name, count)
+        )
         strength = f"harmonic_amplitude@{name.partition('@')[2]}"
         if strength in coordinates.names:  # else a harmonic that had vanished would stay so
             points[:, coordinates.names.index(strength)] = 0.0
@@ -160,8 +198,8 @@ def space_filling(size: int, count: int) -> Float[np.ndarray, "count size"]:
 def halton(size: int, count: int) -> Float[np.ndarray, "count size"]:
     """Scrambled Halton points in the unit cube (Owen 2017, arXiv:1706.02808).
 
-    Those of `scipy.stats.qmc.Halton(size, rng=0)`, for which a fit would wait half a second: that is how long scipy.stats
-    takes to import.
+    Those of `scipy.stats.qmc.Halton(size, rng=0)`, for which a fit would wait half a second: that
+    is how long scipy.stats takes to import.
     """
     (rng,) = np.random.default_rng(0).spawn(1)
     points = np.zeros((count, size))
@@ -178,15 +216,17 @@ def _is_prime(number: int) -> bool:
 
 
 def frequency_names(coordinates: Coordinates) -> list[str]:
-    """The free harmonic frequencies; in a joint fit targets may have one each, called "harmonic_frequency@target"."""
+    """The free harmonic frequencies; in a joint fit targets may have one each, called
+    "harmonic_frequency@target"."""
     return [name for name in coordinates.names if name.partition("@")[0] == "harmonic_frequency"]
 
 
 def contenders(problem: FitProblem, minima: Minima, margin: float) -> list[int]:
-    """The best start, then those whose cost is at most `margin` above it at another harmonic frequency, best first.
+    """The best start, then those whose cost is at most `margin` above it at another harmonic
+    frequency, best first.
 
-    Frequencies differ when no nearer than one bin: a Welch peak is two bins wide, so these are different minima. Where
-    several are free, one that differs is enough.
+    Frequencies differ when no nearer than one bin: a Welch peak is two bins wide, so these are
+    different minima. Where several are free, one that differs is enough.
     """
     theta = np.asarray(problem.coordinates.theta(minima.s))
     return distinct(problem, minima.cost, theta, problem.finest.settings.resolution, margin)
@@ -201,7 +241,8 @@ def distinct(
     most: int | None = None,
     names: list[str] | None = None,
 ) -> list[int]:
-    """The lowest row, then those at most `margin` above it and, in a harmonic frequency, at least `width` from all others.
+    """The lowest row, then those at most `margin` above it and, in a harmonic frequency, at least
+    `width` from all others.
 
     `names` of the frequencies, all that are free unless given.
     """
@@ -213,7 +254,11 @@ def distinct(
     frequency = np.stack([harmonic_frequencies(problem, theta, name) for name in names], axis=1)
     for i in np.argsort(cost, kind="stable"):
         near = np.min(np.max(np.abs(frequency[i] - frequency[chosen]), axis=1)) < width
-        if cost[i] <= cost[chosen[0]] + margin and not near and (most is None or len(chosen) < most):
+        if (
+            cost[i] <= cost[chosen[0]] + margin
+            and not near
+            and (most is None or len(chosen) < most)
+        ):
             chosen.append(int(i))
     return chosen
 
@@ -227,12 +272,13 @@ def harmonic_frequencies(
 
 
 def candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " starts"]:
-    """The target's local maxima, highest above their neighbours first, and a quarter bin beside each; then the band.
+    """The target's local maxima, highest above their neighbours first, and a quarter bin beside
+    each; then the band.
 
     Of more maxima than `MAXIMA` (narrow bins) each is tried before any has others beside it.
 
-    A maximum is the vertex of the parabola through the log powers of three bins: a line that is narrower than a bin is
-    found from nearby, but not from a bin away.
+    A maximum is the vertex of the parabola through the log powers of three bins: a line that is
+    narrower than a bin is found from nearby, but not from a bin away.
     """
     f, p = np.asarray(target.frequency), np.log(np.asarray(target.proportional_power))
     inner = np.flatnonzero((p[1:-1] > p[:-2]) & (p[1:-1] > p[2:])) + 1
@@ -244,19 +290,28 @@ def candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " sta
     near = (near.T if len(peaks) > MAXIMA else near).ravel()
     spread = np.geomspace(f[0], f[-1], max(count, 2))
     order = np.argsort([-np.min(np.abs(np.log(s / np.append(peaks, 1e9)))) for s in spread])
-    return np.concatenate([near[: max(1, count // 2)], spread[order], near[max(1, count // 2) :]])[:count]
+    return np.concatenate([near[: max(1, count // 2)], spread[order], near[max(1, count // 2) :]])[
+        :count
+    ]
 
 
 FREQUENCIES, MAXIMA = 32, 16
 
 
 def points_about(problem: FitProblem, theta: np.ndarray) -> np.ndarray:
-    """A point with each harmonic frequency as it is and at its targets' local maxima and over the band, amplitude free."""
+    """A point with each harmonic frequency as it is and at its targets' local maxima and over the
+    band, amplitude free."""
     names, found = problem.coordinates.names, [theta[None]]
     for name in frequency_names(problem.coordinates):
         points = np.tile(theta, (FREQUENCIES - 1, 1))
-        points[:, names.index(name)] = problem.coordinates.theta_of(name, frequencies_for(problem, name, FREQUENCIES - 1))
-        amplitudes = [i for i, n in enumerate(names) if n in ("harmonic_amplitude", name.replace("frequency", "amplitude"))]
+        points[:, names.index(name)] = problem.coordinates.theta_of(
+            name, frequencies_for(problem, name, FREQUENCIES - 1)
+        )
+        amplitudes = [
+            i
+            for i, n in enumerate(names)
+            if n in ("harmonic_amplitude", name.replace("frequency", "amplitude"))
+        ]
         points[np.ix_(range(0, len(points), 2), amplitudes)] = 0.0
         found.append(points)
     return np.concatenate(found)

@@ -36,16 +36,22 @@ def save(figure: Figure, path: Path) -> None:
     """PNG and PDF, and close the figure."""
     for suffix in (".png", ".pdf"):
         with replacing(path.with_suffix(suffix)) as temporary:
-            figure.savefig(temporary, dpi=DPI, metadata={"CreationDate": None} if suffix == ".pdf" else None)
+            figure.savefig(
+                temporary, dpi=DPI, metadata={"CreationDate": None} if suffix == ".pdf" else None
+            )
     plt.close(figure)
 
 
 def _panels(rows: int, columns: int = 1, height: float = SIZE[1]) -> tuple[Figure, np.ndarray]:
-    figure, axes = plt.subplots(rows, columns, figsize=(SIZE[0], height), layout="constrained", squeeze=False)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(SIZE[0], height), layout="constrained", squeeze=False
+    )
     return figure, axes
 
 
-def slow(samples: Float[np.ndarray, " times"], rate: float, cutoff: float) -> Float[np.ndarray, " times"]:
+def slow(
+    samples: Float[np.ndarray, " times"], rate: float, cutoff: float
+) -> Float[np.ndarray, " times"]:
     """What is slower than `cutoff` [Hz], without delay."""
     return scipy.signal.sosfiltfilt(scipy.signal.butter(4, cutoff, fs=rate, output="sos"), samples)
 
@@ -57,7 +63,15 @@ def _run(run: Trajectory, quantity: str, cutoff: float, words: str) -> Figure:
     whole, near = axes[:, 0]
     whole.plot(run.time, x / held.mean(), color=BLUE, lw=1.0)
     whole.axvspan(*WINDOW, color="0.93", lw=0, zorder=0)
-    whole.text(WINDOW[1] - 0.1, 0.05, "analysed", ha="right", va="bottom", color=GREY, transform=whole.get_xaxis_transform())
+    whole.text(
+        WINDOW[1] - 0.1,
+        0.05,
+        "analysed",
+        ha="right",
+        va="bottom",
+        color=GREY,
+        transform=whole.get_xaxis_transform(),
+    )
     whole.set_xlim(0, WINDOW[1])
     whole.set_xlabel("Time (s)")
     whole.set_ylabel(f"{quantity} / mean")
@@ -77,32 +91,65 @@ def _seed_band(ax: Axes, tuned: Tuned, *, absolute: bool) -> None:
     power = np.asarray(tuned.force.spectrum().power)
     rows = power if absolute else power / power.sum(1, keepdims=True)
     low, high = np.quantile(rows, [0.05, 0.95], axis=0)
-    ax.fill_between(tuned.spectrum.frequency, low, high, color=BLUE, alpha=0.18, lw=0, label="5 to 95 % of single runs")
+    ax.fill_between(
+        tuned.spectrum.frequency,
+        low,
+        high,
+        color=BLUE,
+        alpha=0.18,
+        lw=0,
+        label="5 to 95 % of single runs",
+    )
 
 
-def _mark_peaks(ax: Axes, spectrum: Spectrum, values: Float[np.ndarray, " bins"], *, log: bool = False) -> None:
+def _mark_peaks(
+    ax: Axes, spectrum: Spectrum, values: Float[np.ndarray, " bins"], *, log: bool = False
+) -> None:
     """Arrows at the maximum and the local maxima, with their bins."""
     found = peaks(spectrum)
     for peak in dict.fromkeys((found.maximum, *found.local_maxima)):
         at = int(np.argmin(np.abs(spectrum.frequency - peak.frequency)))
         shift = (18, 8) if not log else (12, 8)
-        ax.annotate(f"{peak.frequency:.3f} Hz", (peak.frequency, values[at]), shift, textcoords="offset points",
-                    fontsize=7.5, arrowprops={"arrowstyle": "-", "lw": 0.6, "shrinkB": 3})  # fmt: skip
+        ax.annotate(
+            f"{peak.frequency:.3f} Hz",
+            (peak.frequency, values[at]),
+            shift,
+            textcoords="offset points",
+            fontsize=7.5,
+            arrowprops={"arrowstyle": "-", "lw": 0.6, "shrinkB": 3},
+        )
 
 
 def _stated(ax: Axes) -> None:
     for f in (LOW, HIGH):
-        ax.axvline(f, color=GREY, lw=0.7, ls=":", label="stated: 0.391, 4.251 Hz" if f == LOW else None, zorder=0)
+        ax.axvline(
+            f,
+            color=GREY,
+            lw=0.7,
+            ls=":",
+            label="stated: 0.391, 4.251 Hz" if f == LOW else None,
+            zorder=0,
+        )
 
 
-def _spectrum(spectrum: Spectrum, colour: str, *, log: bool, tuned: Tuned | None = None, stated: bool = True) -> Figure:
+def _spectrum(
+    spectrum: Spectrum, colour: str, *, log: bool, tuned: Tuned | None = None, stated: bool = True
+) -> Figure:
     """Proportional power, linear or with both axes logarithmic."""
     figure, axes = _panels(1)
     ax = axes[0, 0]
     p = np.asarray(spectrum.power) / np.sum(spectrum.power)
     if tuned is not None:
         _seed_band(ax, tuned, absolute=False)
-    ax.plot(spectrum.frequency, p, color=colour, marker="o", ms=2.8, lw=1.2, label="expected (mean over runs)")
+    ax.plot(
+        spectrum.frequency,
+        p,
+        color=colour,
+        marker="o",
+        ms=2.8,
+        lw=1.2,
+        label="expected (mean over runs)",
+    )
     if stated:
         _stated(ax)
     _mark_peaks(ax, spectrum, p, log=log)
@@ -137,7 +184,15 @@ def fig3(found: Reproduction) -> Figure:
     ax, spectrum = axes[0, 0], found.slifkin.spectrum
     _seed_band(ax, found.slifkin, absolute=True)
     power = np.asarray(spectrum.power)
-    ax.plot(spectrum.frequency, power, color=BLUE, marker="o", ms=2.8, lw=1.2, label="expected (mean over runs)")
+    ax.plot(
+        spectrum.frequency,
+        power,
+        color=BLUE,
+        marker="o",
+        ms=2.8,
+        lw=1.2,
+        label="expected (mean over runs)",
+    )
     _stated(ax)
     _mark_peaks(ax, spectrum, power)
     _frequency(ax, log=False)
@@ -185,10 +240,19 @@ def fig7(found: Reproduction) -> Figure:
     """FFT above Welch."""
     people = found.experiment
     figure, axes = _panels(2, height=4.6)
-    for ax, spectra, title in zip(axes[:, 0], (people.fft, people.welch), ("FFT", "Welch"), strict=True):
+    for ax, spectra, title in zip(
+        axes[:, 0], (people.fft, people.welch), ("FFT", "Welch"), strict=True
+    ):
         for colour, spectrum, recording in zip(PALETTE, spectra, people.recordings, strict=False):
             p = np.asarray(spectrum.power) / np.sum(spectrum.power)
-            ax.plot(spectrum.frequency, p, color=colour, lw=0.6 if title == "FFT" else 1.3, alpha=0.8, label=recording.name)
+            ax.plot(
+                spectrum.frequency,
+                p,
+                color=colour,
+                lw=0.6 if title == "FFT" else 1.3,
+                alpha=0.8,
+                label=recording.name,
+            )
         step = float(np.diff(spectra[0].frequency)[0])
         ax.set_title(f"{_source(people)}: {title}, {step:.4f} Hz")
         _frequency(ax, log=True)
@@ -202,12 +266,20 @@ def fig8(found: Reproduction) -> Figure:
     """One person's power against another's, and the Spearman correlation."""
     people = found.experiment
     figure, axes = _panels(3, 2, height=6.2)
-    figure.set_layout_engine("constrained", w_pad=0.12)  # tick labels stand beyond the ends of equal axes
+    # tick labels stand beyond the ends of equal axes
+    figure.set_layout_engine("constrained", w_pad=0.12)
     kinds = (("FFT", people.fft, people.rho_fft), ("Welch", people.welch, people.rho_welch))
     for column, (title, spectra, rho) in zip(axes.T, kinds, strict=True):
         for ax, (i, j), value in zip(column, people.pairs, rho, strict=True):
             x, y = (np.asarray(spectra[k].power) / np.sum(spectra[k].power) for k in (i, j))
-            ax.loglog(x, y, ".", color=BLUE, ms=2.0 if title == "FFT" else 4.0, alpha=0.5 if title == "FFT" else 1.0)
+            ax.loglog(
+                x,
+                y,
+                ".",
+                color=BLUE,
+                ms=2.0 if title == "FFT" else 4.0,
+                alpha=0.5 if title == "FFT" else 1.0,
+            )
             ends = [min(x.min(), y.min()), max(x.max(), y.max())]
             ax.plot(ends, ends, color=ink(), lw=0.6)
             ax.set_title(f"{title}: ρ = {value:.3f}", fontweight="normal")
@@ -215,7 +287,9 @@ def fig8(found: Reproduction) -> Figure:
             _decades(ax, ends)
             ax.set_xlabel(f"person {i + 1}")
             ax.set_ylabel(f"person {j + 1}")
-    figure.suptitle(f"{_source(people)}: {PROPORTIONAL.lower()} of two people", x=0.01, ha="left", fontsize=8)
+    figure.suptitle(
+        f"{_source(people)}: {PROPORTIONAL.lower()} of two people", x=0.01, ha="left", fontsize=8
+    )
     return figure
 
 
@@ -256,6 +330,14 @@ def _readings(found: Iterable[Reading]) -> Figure:
 
 
 FIGURES: dict[str, Callable[[Reproduction], Figure]] = {
-    "fig2": fig2, "fig3": fig3, "fig4a": fig4a, "fig4b": fig4b, "fig5": fig5, "fig6a": fig6a, "fig6b": fig6b, "fig7": fig7,
-    "fig8": fig8, "readings": readings,
-}  # fmt: skip
+    "fig2": fig2,
+    "fig3": fig3,
+    "fig4a": fig4a,
+    "fig4b": fig4b,
+    "fig5": fig5,
+    "fig6a": fig6a,
+    "fig6b": fig6b,
+    "fig7": fig7,
+    "fig8": fig8,
+    "readings": readings,
+}

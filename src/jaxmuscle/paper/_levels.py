@@ -27,12 +27,14 @@ ENTROPY_SEEDS = 16
 
 
 class Levels(eqx.Module):
-    """Fits to the reconstructed spectra of [30], scaled to other levels of contraction by `at_level`.
+    """Fits to the reconstructed spectra of [30], scaled to other levels of contraction by
+    `at_level`.
 
-    **Fields:** `fractions` (levels,) of the MVC; of the fit at 95 %: `line`, the frequency of its harmonic [Hz], `within`,
-    the share of its power in the compared bins, `power` (levels, bins), `variation` (levels,) with 1.7 % at 30 % MVC,
-    `entropy` (levels, seeds), the approximate entropy of low-passed force, the same noise paths at every level; `at_35`,
-    the spectrum of the fit at 35 %, and `at_35_moved`, the same muscle at 95 %.
+    **Fields:** `fractions` (levels,) of the MVC; of the fit at 95 %: `line`, the frequency of its
+    harmonic [Hz], `within`, the share of its power in the compared bins, `power` (levels, bins),
+    `variation` (levels,) with 1.7 % at 30 % MVC, `entropy` (levels, seeds), the approximate entropy
+    of low-passed force, the same noise paths at every level; `at_35`, the spectrum of the fit at 35
+    %, and `at_35_moved`, the same muscle at 95 %.
     """
 
     fractions: Float[np.ndarray, " levels"]
@@ -65,41 +67,67 @@ class Levels(eqx.Module):
 
     @property
     def entropy_rise(self) -> float:
-        """By how many standard errors the largest mean entropy is above those of both ends of the levels; 0 at an end."""
+        """By how many standard errors the largest mean entropy is above those of both ends of the
+        levels; 0 at an end."""
         top = int(np.argmax(self.entropy.mean(1)))
         if top in (0, len(self.entropy) - 1):
             return 0.0
         rises = [self.entropy[top] - self.entropy[end] for end in (0, -1)]
-        return float(min(np.mean(rise) / (np.std(rise, ddof=1) / np.sqrt(rise.size)) for rise in rises))
+        return float(
+            min(np.mean(rise) / (np.std(rise, ddof=1) / np.sqrt(rise.size)) for rise in rises)
+        )
 
 
 def fitted(level: int) -> AbstractTask:
-    """`Isometric` as fitted to `slifkin-newell-1999-95mvc` or `-35mvc`: levels.toml, which fitting/expected.py writes."""
+    """`Isometric` as fitted to `slifkin-newell-1999-95mvc` or `-35mvc`: levels.toml, which
+    fitting/expected.py writes."""
     return Isometric().replace(**tomllib.loads(bundled_text("levels", "paper"))[f"{level}"])
 
 
 @kept
-def _carried(task: AbstractTask, fractions: Float[Array, " levels"], reference: Float[Array, ""]) -> tuple[Array, Array]:
+def _carried(
+    task: AbstractTask, fractions: Float[Array, " levels"], reference: Float[Array, ""]
+) -> tuple[Array, Array]:
     """Power and coefficient of variation at every level."""
 
     def one(fraction):
-        moments, _ = response(as_arrays(at_level(task, fraction, reference=reference)), task.settings, WINDOW)
+        moments, _ = response(
+            as_arrays(at_level(task, fraction, reference=reference)), task.settings, WINDOW
+        )
         return jnp.asarray(moments.power), jnp.asarray(moments.variation)
 
     return jax.vmap(one)(fractions)
 
 
 def levels() -> Levels:
-    """The fit at 95 % at the levels of [30], 5 to 95 % MVC; and the fit at 35 %, there and at 95 %."""
+    """The fit at 95 % at the levels of [30], 5 to 95 % MVC; and the fit at 35 %, there and at 95
+    %."""
     high, low = fitted(95), fitted(35)
     fractions = np.append(LEVELS, STEADIEST)
-    power, variation = (np.asarray(v) for v in _carried(as_arrays(high), jnp.asarray(fractions), jnp.asarray(0.95)))
-    entropy = np.array([_entropies(at_level(high, fraction, reference=0.95)) for fraction in LEVELS.tolist()])
+    power, variation = (
+        np.asarray(v) for v in _carried(as_arrays(high), jnp.asarray(fractions), jnp.asarray(0.95))
+    )
+    entropy = np.array(
+        [_entropies(at_level(high, fraction, reference=0.95)) for fraction in LEVELS.tolist()]
+    )
     louder = SMALLEST / variation[-1]  # to first order amplitudes and variation are proportional
-    beside, _ = _carried(as_arrays(low), jnp.asarray(np.append(np.full(LEVELS.size, 0.35), 0.95)), jnp.asarray(0.35))
-    at_35, moved = (Spectrum(low.settings.frequency, np.asarray(row), low.settings) for row in (beside[0], beside[-1]))
-    return Levels(LEVELS, power[:-1] * louder**2, variation[:-1] * louder, float(high["harmonic_frequency"]),
-                  within_bins(high), entropy, at_35, moved)  # fmt: skip
+    beside, _ = _carried(
+        as_arrays(low), jnp.asarray(np.append(np.full(LEVELS.size, 0.35), 0.95)), jnp.asarray(0.35)
+    )
+    at_35, moved = (
+        Spectrum(low.settings.frequency, np.asarray(row), low.settings)
+        for row in (beside[0], beside[-1])
+    )
+    return Levels(
+        LEVELS,
+        power[:-1] * louder**2,
+        variation[:-1] * louder,
+        float(high["harmonic_frequency"]),
+        within_bins(high),
+        entropy,
+        at_35,
+        moved,
+    )
 
 
 def _entropies(task: AbstractTask) -> list[float]:

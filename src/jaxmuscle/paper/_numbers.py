@@ -36,12 +36,13 @@ Progress = Callable[[str, float], Any]
 class Tuned(eqx.Module):
     """A preset in Task 1 (force) and in Task 2 (displacement).
 
-    **Fields:** `force`, 32 seeds of P_w; `spectrum`, its expected one; `sine`, the harmonic's share of every bin;
-    `variation`, the expected coefficient of variation; `fast`, the share of the force's variance above 10 Hz; `within`,
-    the share of its power that is in the compared bins (`within_bins`);
-    `displacement`, one seed of x_z at constant forces, with `moved`, its expected spectrum, and `displacement_variation`;
-    `both`, the share of single seeds with the maximum in bin 1 and a local one in bin 11; `swing`, the amplitude of the
-    harmonic in the force, relative to the mean, in the first and the last quarter of the window.
+    **Fields:** `force`, 32 seeds of P_w; `spectrum`, its expected one; `sine`, the harmonic's share
+    of every bin; `variation`, the expected coefficient of variation; `fast`, the share of the
+    force's variance above 10 Hz; `within`, the share of its power that is in the compared bins
+    (`within_bins`); `displacement`, one seed of x_z at constant forces, with `moved`, its expected
+    spectrum, and `displacement_variation`; `both`, the share of single seeds with the maximum in
+    bin 1 and a local one in bin 11; `swing`, the amplitude of the harmonic in the force, relative
+    to the mean, in the first and the last quarter of the window.
     """
 
     force: Trajectory
@@ -58,10 +59,12 @@ class Tuned(eqx.Module):
 
 
 class Concentric(eqx.Module):
-    """Task 1 while the insertion moves by 5 mm against its rising load, and what the force needed does in Task 2.
+    """Task 1 while the insertion moves by 5 mm against its rising load, and what the force needed
+    does in Task 2.
 
-    **Fields:** `mean` of the held P_w [N]; `low`, `high` [Hz], its maximum and the highest local one; `error`, the largest
-    difference between the insertion's way in Task 2 and the prescribed one, relative to the 5 mm.
+    **Fields:** `mean` of the held P_w [N]; `low`, `high` [Hz], its maximum and the highest local
+    one; `error`, the largest difference between the insertion's way in Task 2 and the prescribed
+    one, relative to the 5 mm.
     """
 
     mean: float
@@ -71,7 +74,8 @@ class Concentric(eqx.Module):
 
 
 class Regularity(eqx.Module):
-    """Approximate entropy (m = 2, r = 0.2 σ) of 10 s at 100 Hz, low-passed at 30 Hz as the force is."""
+    """Approximate entropy (m = 2, r = 0.2 σ) of 10 s at 100 Hz, low-passed at 30 Hz as the force
+    is."""
 
     white: float
     white_unfiltered: float
@@ -83,7 +87,8 @@ class Regularity(eqx.Module):
 class Experiment(eqx.Module):
     """Three people's recordings and their spectra, whole recording ("FFT") against Welch.
 
-    **Fields:** `recordings`; `simulated`; `fft`, `welch`; `rho_fft`, `rho_welch`, Spearman correlations of the pairs.
+    **Fields:** `recordings`; `simulated`; `fft`, `welch`; `rho_fft`, `rho_welch`, Spearman
+    correlations of the pairs.
     """
 
     recordings: tuple[Recording, ...]
@@ -108,7 +113,8 @@ class Experiment(eqx.Module):
 
 
 def tuned(task: AbstractTask) -> Tuned:
-    """A preset's force in Task 1, and its displacement in Task 2 under the force that it needs there."""
+    """A preset's force in Task 1, and its displacement in Task 2 under the force that it needs
+    there."""
     moments, _ = expected_moments(task, task.settings, WINDOW)
     runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
     second = pulled(task)
@@ -116,13 +122,17 @@ def tuned(task: AbstractTask) -> Tuned:
     fast = np.mean([fast_share(row, runs.rate) for row in np.asarray(runs.between())])
     return Tuned(
         force=runs,
-        spectrum=Spectrum(task.settings.frequency, np.asarray(moments.power), task.settings, task.output_unit),
+        spectrum=Spectrum(
+            task.settings.frequency, np.asarray(moments.power), task.settings, task.output_unit
+        ),
         sine=np.asarray(moments.line / moments.power),
         variation=float(moments.variation),
         fast=float(fast),
         within=within_bins(task),
         displacement=stack([ensemble(second, jax.random.key(0), seeds=1, control=False)], 1),
-        moved=Spectrum(second.settings.frequency, np.asarray(moved.power), second.settings, second.output_unit),
+        moved=Spectrum(
+            second.settings.frequency, np.asarray(moved.power), second.settings, second.output_unit
+        ),
         displacement_variation=float(moved.variation),
         both=_both(runs),
         swing=_swing(runs),
@@ -130,13 +140,23 @@ def tuned(task: AbstractTask) -> Tuned:
 
 
 def concentric(task: AbstractTask) -> Concentric:
-    """A preset of Task 1 with a moving insertion; what its force does in Task 2 without noise and harmonic."""
+    """A preset of Task 1 with a moving insertion; what its force does in Task 2 without noise and
+    harmonic."""
     way = SmoothStep(MOVED)
     moving = task.with_parts(x_z=way)
     moments, _ = expected_moments(moving, moving.settings, WINDOW)
-    found = peaks(Spectrum(moving.settings.frequency, np.asarray(moments.power), moving.settings, moving.output_unit))
+    found = peaks(
+        Spectrum(
+            moving.settings.frequency,
+            np.asarray(moments.power),
+            moving.settings,
+            moving.output_unit,
+        )
+    )
     high = max(found.local_maxima, key=lambda peak: peak.power, default=found.maximum)
-    back = ensemble(pulled(moving, MOVED).replace(**SILENT), jax.random.key(0), seeds=1, control=False)
+    back = ensemble(
+        pulled(moving, MOVED).replace(**SILENT), jax.random.key(0), seeds=1, control=False
+    )
     wanted = np.asarray(jax.vmap(way)(jnp.asarray(back.time)))
     error = np.abs(np.asarray(back.output)[0] - wanted).max() / MOVED
     return Concentric(float(moments.mean), found.maximum.frequency, high.frequency, float(error))
@@ -144,12 +164,20 @@ def concentric(task: AbstractTask) -> Concentric:
 
 def _both(runs: Trajectory) -> float:
     spectra = runs.spectrum()
-    each = [peaks(Spectrum(spectra.frequency, row, spectra.settings)) for row in np.asarray(spectra.power)]
-    return float(np.mean([p.maximum.bin == LOW_BIN and HIGH_BIN in [q.bin for q in p.local_maxima] for p in each]))
+    each = [
+        peaks(Spectrum(spectra.frequency, row, spectra.settings))
+        for row in np.asarray(spectra.power)
+    ]
+    return float(
+        np.mean(
+            [p.maximum.bin == LOW_BIN and HIGH_BIN in [q.bin for q in p.local_maxima] for p in each]
+        )
+    )
 
 
 def _swing(runs: Trajectory) -> tuple[float, float]:
-    """From the mean over the seeds, in which noise is smaller: sine, cosine and a straight line by least squares."""
+    """From the mean over the seeds, in which noise is smaller: sine, cosine and a straight line by
+    least squares."""
     mean = np.asarray(runs.between()).mean(0)
     time, quarter = WINDOW[0] + np.arange(mean.size) / runs.rate, mean.size // 4
     angle = 2 * np.pi * float(runs.task["harmonic_frequency"]) * time
@@ -172,45 +200,72 @@ def regularity(force: Trajectory) -> Regularity:
     white = np.random.default_rng(0).normal(size=1500)
     sines = tuple(of(np.sin(2 * np.pi * f * time)) for f in SINES)
     one = np.asarray(force.output)[0, :1500]
-    return Regularity(of(white), approximate_entropy(white[500:]), sines, of(one), approximate_entropy(one[500:]))
+    return Regularity(
+        of(white), approximate_entropy(white[500:]), sines, of(one), approximate_entropy(one[500:])
+    )
 
 
 def person(number: int) -> AbstractTask:
-    """A simulated person, 0 to 2: stiffness, damping, noise and harmonic up to 10 % off the defaults, in Task 2.
+    """A simulated person, 0 to 2: stiffness, damping, noise and harmonic up to 10 % off the
+    defaults, in Task 2.
 
-    Ornstein-Uhlenbeck noise of 5 %: fluctuations of a fraction of a millimetre, as of a finger that is held still.
+    Ornstein-Uhlenbeck noise of 5 %: fluctuations of a fraction of a millimetre, as of a finger that
+    is held still.
     """
     task = PrescribedForce(P_w=5.0, noise=OrnsteinUhlenbeckNoise([0.05, 0.005, 0.0, 0.0], 0.1))
     factor = (0.9, 1.0, 1.1)[number]
-    return task.replace(**{n: task[n] * (factor if i % 2 == 0 else 2 - factor) for i, n in enumerate(PERSON)})
+    return task.replace(
+        **{n: task[n] * (factor if i % 2 == 0 else 2 - factor) for i, n in enumerate(PERSON)}
+    )
 
 
 def recorded(task: AbstractTask, seeds: int = 1, key: int = 100) -> tuple[Recording, ...]:
     """60 s of x_z [m] at 120 Hz, after a rise of 5 s, as recordings."""
-    runs = ensemble(task, jax.random.key(key), seeds=seeds, duration=65.0, dt=1 / 1200, rate=120.0, control=False)
+    runs = ensemble(
+        task,
+        jax.random.key(key),
+        seeds=seeds,
+        duration=65.0,
+        dt=1 / 1200,
+        rate=120.0,
+        control=False,
+    )
     rows = np.asarray(runs.between((5.0, 65.0)))
     source = "simulated by jaxmuscle reproduce"
-    return tuple(Recording(row, 120.0, unit="m", name=f"run {i + 1}", source=source) for i, row in enumerate(rows))
+    return tuple(
+        Recording(row, 120.0, unit="m", name=f"run {i + 1}", source=source)
+        for i, row in enumerate(rows)
+    )
 
 
 def simulated_recordings() -> tuple[Recording, ...]:
     """Three simulated people."""
     found = [recorded(person(number), key=100 + number)[0] for number in range(3)]
-    return tuple(Recording(r.whole, r.rate, unit=r.unit, name=f"simulated person {i + 1}", source=r.source)
-                 for i, r in enumerate(found))  # fmt: skip
+    return tuple(
+        Recording(r.whole, r.rate, unit=r.unit, name=f"simulated person {i + 1}", source=r.source)
+        for i, r in enumerate(found)
+    )
 
 
-def given_recordings(recordings: Sequence[Recording | str | os.PathLike[str]]) -> tuple[Recording, ...]:
-    """Three recordings, files loaded, cut to the length of the shortest so that their spectra have the same bins."""
+def given_recordings(
+    recordings: Sequence[Recording | str | os.PathLike[str]],
+) -> tuple[Recording, ...]:
+    """Three recordings, files loaded, cut to the length of the shortest so that their spectra have
+    the same bins."""
     from jaxmuscle.data._recording_files import load_recording
 
     if isinstance(recordings, str | os.PathLike) or len(recordings) != 3:
         count = 1 if isinstance(recordings, str | os.PathLike) else len(recordings)
-        raise ValueError(f"recordings: {count} given, three are compared: give one for each of three people")
+        raise ValueError(
+            f"recordings: {count} given, three are compared: give one for each of three people"
+        )
     loaded = [r if isinstance(r, Recording) else load_recording(r) for r in recordings]
     quantities = [r.quantity for r in loaded]
     if len(set(quantities)) > 1:
-        raise ValueError(f"recordings of {', '.join(str(q) for q in quantities)}: give three of the same quantity")
+        raise ValueError(
+            f"recordings of {', '.join(str(q) for q in quantities)}: give three of the same"
+            " quantity"
+        )
     shortest = min(r.duration for r in loaded)
     return tuple(r.steady((float(r.time[0]), float(r.time[0]) + shortest)) for r in loaded)
 
@@ -225,7 +280,8 @@ def experiment(given: tuple[Recording, ...] | None = None) -> Experiment:
 class Reproduction(eqx.Module):
     """Everything that the figures and the table of claims are made of.
 
-    `same_muscle`: the experiment with three runs of `zagrodny-slifkin` in Task 2 instead of three people.
+    `same_muscle`: the experiment with three runs of `zagrodny-slifkin` in Task 2 instead of three
+    people.
     """
 
     slifkin: Tuned
@@ -238,7 +294,9 @@ class Reproduction(eqx.Module):
     readings: tuple[Reading, ...]
 
 
-def computed(given: tuple[Recording, ...] | None = None, report: Progress = lambda text, share: None) -> Reproduction:
+def computed(
+    given: tuple[Recording, ...] | None = None, report: Progress = lambda text, share: None
+) -> Reproduction:
     """All numbers, in float64; nothing is written."""
     with jax.enable_x64(True):
         report("Task 1 and 2, zagrodny-slifkin", 0.0)

@@ -1,4 +1,5 @@
-"""Three readings of the 0.391 Hz and 4.251 Hz maxima: which of the facts that the paper states does each of them give?"""
+"""Three readings of the 0.391 Hz and 4.251 Hz maxima: which of the facts that the paper states does
+each of them give?"""
 
 import equinox as eqx
 import jax
@@ -19,7 +20,8 @@ from jaxmuscle.spectra._welch import Spectrum
 LOW, HIGH = 0.391, 4.251  # Hz, the paper's maxima
 LOW_BIN, HIGH_BIN = 1, 11
 LINE = 0.5  # a bin is called a sine if at least half of its power is one
-FAST, FAST_SHARE = 10.0, 0.1  # Hz, and the share of the variance above it that is seen as fast noise
+# Hz, and the share of the variance above it that is seen as fast noise
+FAST, FAST_SHARE = 10.0, 0.1
 HELD = 0.001  # m; Task 2 about x_z = 0, as in Task 1, has a displacement that cannot be normalised
 SILENT = {f"noise_{channel}": 0.0 for channel in CHANNELS} | {"harmonic_amplitude": 0.0}
 PAPER_NOISE = [0.0016, 0.0016, 0.0001, 0.0001]
@@ -36,13 +38,15 @@ FACTS = {
 
 
 def fast_share(samples: Float[np.ndarray, " times"], rate: float) -> float:
-    """Share of a signal's variance above 10 Hz, up to half the sampling rate (nothing is filtered)."""
+    """Share of a signal's variance above 10 Hz, up to half the sampling rate (nothing is
+    filtered)."""
     power = np.abs(np.fft.rfft(samples - samples.mean())) ** 2
     return float(power[np.fft.rfftfreq(samples.size, 1 / rate) > FAST].sum() / power.sum())
 
 
 def within_bins(task: AbstractTask) -> float:
-    """Share of the expected power, after the low-pass, from bin 1 to half the sampling rate that is in the compared bins."""
+    """Share of the expected power, after the low-pass, from bin 1 to half the sampling rate that is
+    in the compared bins."""
     settings = task.settings.replace(last_bin=task.settings.length // 2)
     power = np.asarray(expected_moments(task, settings, WINDOW)[0].power)
     return float(power[: task.settings.last_bin].sum() / power.sum())
@@ -51,9 +55,10 @@ def within_bins(task: AbstractTask) -> float:
 class Reading(eqx.Module):
     """One explanation of the two maxima, built as a task and judged.
 
-    **Fields:** `key`; `words`, what it says; `task`; `force`, one seed's output in the window [N]; `spectrum`, the mean
-    one of the force; `displacement`, the expected spectrum in Task 2; `sine_share`, of bin 1's power; `fast_share`, of the
-    force's variance above 10 Hz; `facts`, the keys of `FACTS` with whether they hold.
+    **Fields:** `key`; `words`, what it says; `task`; `force`, one seed's output in the window [N];
+    `spectrum`, the mean one of the force; `displacement`, the expected spectrum in Task 2;
+    `sine_share`, of bin 1's power; `fast_share`, of the force's variance above 10 Hz; `facts`, the
+    keys of `FACTS` with whether they hold.
     """
 
     key: str
@@ -75,8 +80,9 @@ class Reading(eqx.Module):
 def pulled(task: AbstractTask, x_z: float = HELD) -> AbstractTask:
     """The same muscle in Task 2, constant forces from 5 s on.
 
-    For Task 1 the P_w(t) that it needs, without noise and harmonic, to hold the insertion at `x_z` [m] against its load: so
-    nothing else than noise and harmonic moves it in the window. For another task its own P_w without load.
+    For Task 1 the P_w(t) that it needs, without noise and harmonic, to hold the insertion at `x_z`
+    [m] against its load: so nothing else than noise and harmonic moves it in the window. For
+    another task its own P_w without load.
     """
     if not isinstance(task, PrescribedMotion):
         return task.as_task(PrescribedForce, P_w=float(task["P_w"]))
@@ -86,7 +92,8 @@ def pulled(task: AbstractTask, x_z: float = HELD) -> AbstractTask:
 
 
 def resonant() -> AbstractTask:
-    """Isometric, the paper's noise, a harmonic at 0.391 Hz, and masses and springs that resonate near 4.25 Hz."""
+    """Isometric, the paper's noise, a harmonic at 0.391 Hz, and masses and springs that resonate
+    near 4.25 Hz."""
     muscle = Muscle(m_w=0.5, m_z=0.5)
     harmonic = Harmonic(amplitude=0.002, frequency=LOW)
     task = Isometric(P_w=3.5, muscle=muscle, harmonic=harmonic, noise=BandLimitedNoise(PAPER_NOISE))
@@ -94,16 +101,33 @@ def resonant() -> AbstractTask:
 
 
 def readings(preset: AbstractTask) -> tuple[Reading, ...]:
-    """A, B (as it is and in Task 1), C (leakage of the mean, slow transient) about the preset of Figures 2 to 5."""
+    """A, B (as it is and in Task 1), C (leakage of the mean, slow transient) about the preset of
+    Figures 2 to 5."""
     pwelch = SpectrumSettings.pwelch()
     return (
         _stationary("A", "a harmonic at 4.25 Hz on slow relaxation", preset),
-        _stationary("B", "a harmonic at 0.391 Hz, a resonance near 4.25 Hz (isometric: two states)", resonant()),
-        _stationary("B1", "the same in Task 1, whose one state cannot resonate", preset.replace(harmonic_frequency=LOW)),
-        _simulated(
-            "C1", "no slow part; the mean leaks into bin 1 (pwelch: Hamming, no detrend)", preset.replace(c_z=5.0), pwelch
+        _stationary(
+            "B",
+            "a harmonic at 0.391 Hz, a resonance near 4.25 Hz (isometric: two states)",
+            resonant(),
         ),
-        _simulated("C2", "a transient slower than the window, mean removed", preset.replace(c_z=1000.0), preset.settings),
+        _stationary(
+            "B1",
+            "the same in Task 1, whose one state cannot resonate",
+            preset.replace(harmonic_frequency=LOW),
+        ),
+        _simulated(
+            "C1",
+            "no slow part; the mean leaks into bin 1 (pwelch: Hamming, no detrend)",
+            preset.replace(c_z=5.0),
+            pwelch,
+        ),
+        _simulated(
+            "C2",
+            "a transient slower than the window, mean removed",
+            preset.replace(c_z=1000.0),
+            preset.settings,
+        ),
     )
 
 
@@ -111,11 +135,19 @@ def _stationary(key: str, words: str, task: AbstractTask) -> Reading:
     """By the expected spectrum; the time series from one seed."""
     moments, _ = expected_moments(task, task.settings, WINDOW)
     runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
-    return _judged(key, words, task, np.asarray(runs.between())[0], _spectrum(task, moments.power), _sine(moments))
+    return _judged(
+        key,
+        words,
+        task,
+        np.asarray(runs.between())[0],
+        _spectrum(task, moments.power),
+        _sine(moments),
+    )
 
 
 def _simulated(key: str, words: str, task: AbstractTask, settings: SpectrumSettings) -> Reading:
-    """By the mean spectrum of 16 seeds: neither a mean that leaks nor a transient has an expected spectrum."""
+    """By the mean spectrum of 16 seeds: neither a mean that leaks nor a transient has an expected
+    spectrum."""
     runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
     moments, _ = expected_moments(task, settings, WINDOW)
     mean = runs.spectrum(settings).mean()
@@ -125,7 +157,12 @@ def _simulated(key: str, words: str, task: AbstractTask, settings: SpectrumSetti
 
 
 def _judged(
-    key: str, words: str, task: AbstractTask, force: Float[np.ndarray, " times"], spectrum: Spectrum, sine: float
+    key: str,
+    words: str,
+    task: AbstractTask,
+    force: Float[np.ndarray, " times"],
+    spectrum: Spectrum,
+    sine: float,
 ) -> Reading:
     second = pulled(task)
     moments, _ = expected_moments(second, second.settings, WINDOW)
@@ -160,10 +197,12 @@ def conclusion(found: tuple[Reading, ...]) -> str:
         first = "No reading gives all that is stated."
     lacking = {key: "; ".join(by[key].missing) for key in ("A", "B")}
     return (
-        f"{first} A lacks: {lacking['A'] or 'nothing'}. B lacks: {lacking['B'] or 'nothing'}. In Task 1 there is no "
-        "resonance at all: with x_z prescribed x_w obeys one equation of first order, so white noise gives P_w the density "
-        "(a + bω² + cω⁴)/(ω² + p²), which has a minimum at most, never a local maximum; there the local maximum can only be "
-        "the harmonic. C puts all power into bin 1 and leaves no local maximum of 1 %, and its force holds no sine. So A is "
-        "the reading of the figures of Task 1, with the 4.25 Hz sine as the slow one beside noise that reaches 50 Hz; if "
-        "the text of Figure 2 means the lower frequency, only B has that sine, and then the force is not that of Task 1."
+        f"{first} A lacks: {lacking['A'] or 'nothing'}. B lacks: {lacking['B'] or 'nothing'}. In"
+        " Task 1 there is no resonance at all: with x_z prescribed x_w obeys one equation of first"
+        " order, so white noise gives P_w the density (a + bω² + cω⁴)/(ω² + p²), which has a"
+        " minimum at most, never a local maximum; there the local maximum can only be the"
+        " harmonic. C puts all power into bin 1 and leaves no local maximum of 1 %, and its force"
+        " holds no sine. So A is the reading of the figures of Task 1, with the 4.25 Hz sine as"
+        " the slow one beside noise that reaches 50 Hz; if the text of Figure 2 means the lower"
+        " frequency, only B has that sine, and then the force is not that of Task 1."
     )

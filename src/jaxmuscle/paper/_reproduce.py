@@ -20,15 +20,18 @@ def reproduce(
 
         jm.reproduce("out/reproduce")
 
-    Writes fig2, fig3, fig4a, fig4b, fig5, fig6a, fig6b, fig7, fig8 as .png and .pdf, claims.json and index.html.
+    Writes fig2, fig3, fig4a, fig4b, fig5, fig6a, fig6b, fig7, fig8 as .png and .pdf, claims.json
+    and index.html.
 
     **Arguments:**
 
     - `out`: a folder
-    - `recordings`: three of your own (`Recording` or file) instead of the simulated ones of Figures 7 and 8
+    - `recordings`: three of your own (`Recording` or file) instead of the simulated ones of Figures
+      7 and 8
     - `progress`: a bar on a terminal
 
-    **Raises:** `ValueError` unless there are three recordings of one quantity, and for a file that cannot be read.
+    **Raises:** `ValueError` unless there are three recordings of one quantity, and for a file that
+    cannot be read.
     """
     from jaxmuscle._common.progress import told
 
@@ -41,7 +44,9 @@ def reproduce(
         return _written(Path(out), given, report, draw, check, write_page)
 
 
-def _written(out: Path, given: tuple[Recording, ...] | None, report: Progress, draw, check, write_page) -> Reproduction:
+def _written(
+    out: Path, given: tuple[Recording, ...] | None, report: Progress, draw, check, write_page
+) -> Reproduction:
     found = computed(given, report)
     report("figures", 0.8)
     with jax.enable_x64(True):

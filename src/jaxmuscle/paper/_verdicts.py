@@ -1,4 +1,5 @@
-"""A statement of the papers beside our numbers: when the two agree, and what their agreement is worth."""
+"""A statement of the papers beside our numbers: when the two agree, and what their agreement is
+worth."""
 
 import re
 from collections.abc import Callable, Iterable
@@ -7,24 +8,38 @@ from typing import Literal, NamedTuple
 from ._numbers import Reproduction
 
 Verdict = Literal["agrees", "agrees within our resolution", "does not agree", "cannot be checked"]
-AGREES, GRID, DIFFERS, UNCHECKED = "agrees", "agrees within our resolution", "does not agree", "cannot be checked"
+AGREES, GRID, DIFFERS, UNCHECKED = (
+    "agrees",
+    "agrees within our resolution",
+    "does not agree",
+    "cannot be checked",
+)
 Kind = Literal["tests the model", "fitted", "put in", "arithmetic"]
 TESTED, FITTED, GIVEN, ARITHMETIC = "tests the model", "fitted", "put in", "arithmetic"
 KINDS: dict[Kind, str] = {
-    TESTED: "Nothing of it was put in, so it could have come out otherwise. Only these count for the model or against it.",
-    FITTED: "The model was fitted to a curve made from it, or its parameters were chosen until it held. Where it agrees, "
-    "the model can do this; where it does not, it cannot.",
-    GIVEN: "An input, a setting or a law that jaxmuscle assumes, or what follows from one whatever the muscle.",
+    TESTED: (
+        "Nothing of it was put in, so it could have come out otherwise. Only these count for the"
+        " model or against it."
+    ),
+    FITTED: (
+        "The model was fitted to a curve made from it, or its parameters were chosen until it held."
+        " Where it agrees, the model can do this; where it does not, it cannot."
+    ),
+    GIVEN: (
+        "An input, a setting or a law that jaxmuscle assumes, or what follows from one whatever the"
+        " muscle."
+    ),
     ARITHMETIC: "It follows from the stated numbers alone, without a model.",
 }
 Numbers = tuple[float, ...]
 
 
 class Claim(NamedTuple):
-    """One statement: where it stands, what it says, our numbers and how they are shown, how they were obtained, the rule.
+    """One statement: where it stands, what it says, our numbers and how they are shown, how they
+    were obtained, the rule.
 
-    `kind` is what an agreement is worth (`KINDS`). `why` is shown unless the verdict is a plain "agrees"; `words` and `why`
-    are formats of the numbers.
+    `kind` is what an agreement is worth (`KINDS`). `why` is shown unless the verdict is a plain
+    "agrees"; `words` and `why` are formats of the numbers.
     """
 
     key: str
@@ -58,24 +73,39 @@ def checked(claim: Claim, found: Reproduction) -> Row:
     verdict = claim.rule(*numbers)
     why = "" if verdict == AGREES else claim.why.format(*numbers)
     ours = re.sub(r"(?<=\d)%", " %", claim.words.format(*numbers))
-    return Row(claim.key, claim.kind, claim.source, claim.says, ours, numbers, claim.how, verdict, why)
+    return Row(
+        claim.key, claim.kind, claim.source, claim.says, ours, numbers, claim.how, verdict, why
+    )
 
 
 def counted(rows: Iterable[Row]) -> str:
-    """How many statements there are, how many test the model, and what came of them, in one sentence."""
+    """How many statements there are, how many test the model, and what came of them, in one
+    sentence."""
     rows = tuple(rows)
     tests = [row for row in rows if row.kind == TESTED]
     others = [(kind, [row for row in rows if row.kind == kind]) for kind in KINDS if kind != TESTED]
     beside = ", ".join(f"{len(some)} {kind}{_failed(some)}" for kind, some in others)
-    return f"Of {len(rows)} statements {len(tests)} test the model: {outcome(tests)}. Not counted for it: {beside}."
+    return (
+        f"Of {len(rows)} statements {len(tests)} test the model: {outcome(tests)}. Not counted for"
+        f" it: {beside}."
+    )
 
 
 def outcome(rows: Iterable[Row]) -> str:
     """How many agree, how many do not, how many cannot be checked."""
     verdicts = [row.verdict for row in rows]
-    agree, within, differ = sum(v in (AGREES, GRID) for v in verdicts), verdicts.count(GRID), verdicts.count(DIFFERS)
-    told = f"{agree} {'agrees' if agree == 1 else 'agree'}" + (f" ({within} within our resolution)" if within else "")
-    return f"{told}, {differ} {'does' if differ == 1 else 'do'} not, {verdicts.count(UNCHECKED)} cannot be checked"
+    agree, within, differ = (
+        sum(v in (AGREES, GRID) for v in verdicts),
+        verdicts.count(GRID),
+        verdicts.count(DIFFERS),
+    )
+    told = f"{agree} {'agrees' if agree == 1 else 'agree'}" + (
+        f" ({within} within our resolution)" if within else ""
+    )
+    return (
+        f"{told}, {differ} {'does' if differ == 1 else 'do'} not, {verdicts.count(UNCHECKED)}"
+        " cannot be checked"
+    )
 
 
 def _failed(rows: Iterable[Row]) -> str:
@@ -89,7 +119,8 @@ def holds(condition: Callable[..., bool], otherwise: Verdict = DIFFERS) -> Calla
 
 
 def near(stated: float, half_bin: float) -> Callable[..., Verdict]:
-    """The rule of a stated frequency that is not on the grid: all found ones within half a bin of it."""
+    """The rule of a stated frequency that is not on the grid: all found ones within half a bin of
+    it."""
     return lambda *found: GRID if all(abs(f - stated) <= half_bin for f in found) else DIFFERS
 
 

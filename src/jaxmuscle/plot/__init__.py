@@ -1,7 +1,7 @@
 """All figures. Nothing is shown, closed or configured globally.
 
-What has one pair of axes draws into `ax` or a new figure and returns the axes. What has several panels (`ax`: the place in a
-grid that they take) returns the figure, or the part of yours.
+What has one pair of axes draws into `ax` or a new figure and returns the axes. What has several
+panels (`ax`: the place in a grid that they take) returns the figure, or the part of yours.
 """
 
 import lazy_loader

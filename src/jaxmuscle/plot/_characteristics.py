@@ -13,17 +13,21 @@ TISSUES = (("w", BLUE, "active tissue", 3.0), ("z", VERMILLION, "passive tissue"
 
 @styled
 def static(curves: Any, ax: Any = None) -> tuple[Axes, Axes, Axes]:
-    """Draws K(x), C(v) and force against displacement, in three axes (`ax`: three of yours). Returns the axes.
+    """Draws K(x), C(v) and force against displacement, in three axes (`ax`: three of yours).
+    Returns the axes.
 
     `curves` are the `StaticCharacteristics` that `jaxmuscle.static_characteristics(task)` returns.
 
-    Thick lines are the active tissue, thin ones the passive; dashed is the slope of the force of a spring, dotted the
-    operating point. In a figure of its own one legend names all lines, and letters are legible in a column of 85 mm.
+    Thick lines are the active tissue, thin ones the passive; dashed is the slope of the force of a
+    spring, dotted the operating point. In a figure of its own one legend names all lines, and
+    letters are legible in a column of 85 mm.
 
     **Raises:** `ValueError` unless `ax` has three.
     """
     if ax is not None and len(ax) != 3:
-        raise ValueError(f"ax has {len(ax)} axes: give three, for K(x), C(v) and force against displacement")
+        raise ValueError(
+            f"ax has {len(ax)} axes: give three, for K(x), C(v) and force against displacement"
+        )
     stiffness, damping, force = _places(canvas(None, (COLUMN, sum(HEIGHTS)))) if ax is None else ax
     _coefficients(curves, stiffness, damping)
     _forces(curves, force)
@@ -46,11 +50,22 @@ def _coefficients(curves: Any, stiffness: Axes, damping: Axes) -> None:
     for j, colour, tissue, width in TISSUES:
         stiffness.plot(x, getattr(curves, f"K_{j}"), color=colour, lw=width, label=tissue)
         slope = rf"slope of its spring, d$F_\mathrm{{{j}}}$/d$x$"
-        stiffness.plot(x, getattr(curves, f"K_{j}_tangent"), color=colour, lw=0.7 * width, ls="--", label=slope)
-        damping.plot(curves.velocity, getattr(curves, f"C_{j}"), color=colour, lw=width, label=tissue)
+        stiffness.plot(
+            x, getattr(curves, f"K_{j}_tangent"), color=colour, lw=0.7 * width, ls="--", label=slope
+        )
+        damping.plot(
+            curves.velocity, getattr(curves, f"C_{j}"), color=colour, lw=width, label=tissue
+        )
         place = getattr(curves, f"x_{j}")
         if np.isfinite(place):
-            stiffness.axvline(1e3 * place, color=colour, lw=0.8, ls=":", label=rf"$x_\mathrm{{{j}}}$ of the task", zorder=1)
+            stiffness.axvline(
+                1e3 * place,
+                color=colour,
+                lw=0.8,
+                ls=":",
+                label=rf"$x_\mathrm{{{j}}}$ of the task",
+                zorder=1,
+            )
     for panel in (stiffness, damping):
         panel.set_ylim(bottom=min(panel.get_ylim()[0], 0.0), auto=None)
     stiffness.set(title="Stiffness K(x)", xlabel="Displacement (mm)", ylabel="Stiffness (N/m)")

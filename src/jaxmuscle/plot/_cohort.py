@@ -11,22 +11,40 @@ from matplotlib.figure import Figure, SubFigure
 
 from ._numbers import in_words
 from ._study import columns, counted, group_spectra
-from ._style import BLUE, COLUMN, GREY, LINE, PALETTE, canvas, fitted_to, frequency_axis, key, named, styled
+from ._style import (
+    BLUE,
+    COLUMN,
+    GREY,
+    LINE,
+    PALETTE,
+    canvas,
+    fitted_to,
+    frequency_axis,
+    key,
+    named,
+    styled,
+)
 
 WAYS = ("person", "group", "level")
 HEIGHT, ACROSS, SPECTRA = 1.6, 2, 2.3  # inches, panels, inches
 LABELLED = 12  # people who get a name on the axis
 LONGEST = 20  # letters of it
-LETTER, FREE = 0.055, 6  # inches that a letter needs downwards, letters for which there is room anyway
+# inches that a letter needs downwards, letters for which there is room anyway
+LETTER, FREE = 0.055, 6
 ROOM = 16  # letters of all groups' names below a panel; else they stand in a key
 SHARE = 0.5  # of the targets that must determine a quantity for it to be drawn
 
 
 @styled
 def cohort(
-    cohort: Any, by: str = "person", ax: Axes | None = None, *, quantities: Collection[str] | None = None
+    cohort: Any,
+    by: str = "person",
+    ax: Axes | None = None,
+    *,
+    quantities: Collection[str] | None = None,
 ) -> Figure | SubFigure:
-    """Draws what at least half of the targets determine, `by` "person", "group" or "level" (fraction of MVC).
+    """Draws what at least half of the targets determine, `by` "person", "group" or "level"
+    (fraction of MVC).
 
     `quantities`, only these.
 
@@ -35,7 +53,9 @@ def cohort(
     if by not in WAYS:
         raise ValueError(f"by = {by!r}: choose one of {', '.join(WAYS)}")
     names = _drawn(cohort, quantities)
-    if by == "level" and all(result.target.mvc_fraction is None for result in cohort.results.values()):
+    if by == "level" and all(
+        result.target.mvc_fraction is None for result in cohort.results.values()
+    ):
         raise ValueError("by = 'level': no target states its mvc_fraction")
     height = (HEIGHT + (_below(cohort) if by == "person" else 0.0)) * -(-len(names) // ACROSS)
     fig = canvas(ax, (COLUMN, height))
@@ -46,12 +66,15 @@ def cohort(
 
 
 @styled
-def groups(cohort: Any, ax: Axes | None = None, *, quantities: Collection[str] | None = None) -> Figure | SubFigure:
+def groups(
+    cohort: Any, ax: Axes | None = None, *, quantities: Collection[str] | None = None
+) -> Figure | SubFigure:
     """Draws the spectra of the groups of a cohort, and what the fits found by group.
 
-    Above: every target (thin), the geometric mean of each group with its standard error (thick). Below: what at least half
-    of the targets determine, with standard errors; the grey line is the mean of the group. `quantities`, only these.
-    Where the targets differ in their bins, their spectra have no mean and are left out.
+    Above: every target (thin), the geometric mean of each group with its standard error (thick).
+    Below: what at least half of the targets determine, with standard errors; the grey line is the
+    mean of the group. `quantities`, only these. Where the targets differ in their bins, their
+    spectra have no mean and are left out.
 
     **Raises:** `ValueError` if nothing is determined by half of the targets.
     """
@@ -69,7 +92,9 @@ def groups(cohort: Any, ax: Axes | None = None, *, quantities: Collection[str] |
     if alike:
         panel = places[0].add_subplot()
         for number, group in enumerate(_groups(cohort)):
-            here = [target for name, target in targets.items() if cohort.groups.get(name, "") == group]
+            here = [
+                target for name, target in targets.items() if cohort.groups.get(name, "") == group
+            ]
             group_spectra(panel, here, PALETTE[number % len(PALETTE)], labels[group], True)
         frequency_axis(panel, log=True)
         panel.set_ylabel("Power (fraction per bin)")
@@ -103,7 +128,9 @@ def _drawn(cohort: Any, quantities: Collection[str] | None) -> dict[str, list[di
     enough = SHARE * max(len(cohort.results), 1)
     found = {name: rows for name, rows in found.items() if len(rows) >= enough}
     if not found:
-        raise ValueError("no quantity is determined by at least half of the targets: there is nothing to draw")
+        raise ValueError(
+            "no quantity is determined by at least half of the targets: there is nothing to draw"
+        )
     return found
 
 
@@ -116,26 +143,50 @@ def _panels(fig: Any, cohort: Any, names: dict[str, list[dict[str, Any]]], by: s
     fig.align_ylabels()
 
 
-def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list[str], by: str) -> None:
+def _panel(
+    ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list[str], by: str
+) -> None:
     for number, group in enumerate(groups):
-        here = [row for row in rows if row["group"] == group and (by != "level" or row["mvc_fraction"] is not None)]
-        value, error = (np.array([row[key] for row in here], dtype=float) for key in ("value", "stderr"))
+        here = [
+            row
+            for row in rows
+            if row["group"] == group and (by != "level" or row["mvc_fraction"] is not None)
+        ]
+        value, error = (
+            np.array([row[key] for row in here], dtype=float) for key in ("value", "stderr")
+        )
         colour = PALETTE[number % len(PALETTE)] if len(groups) > 1 else BLUE
         if by == "person":
             place = np.array([people.index(row["target"]) for row in here], dtype=float)
         elif by == "level":
             place = np.array([100 * row["mvc_fraction"] for row in here], dtype=float)
         else:
-            place = number + np.linspace(-0.25, 0.25, len(here)) if len(here) > 1 else np.array([float(number)] * len(here))
+            place = (
+                number + np.linspace(-0.25, 0.25, len(here))
+                if len(here) > 1
+                else np.array([float(number)] * len(here))
+            )
             if len(here):
                 ax.hlines(value.mean(), number - 0.35, number + 0.35, color=GREY, linewidth=1)
         label = named(group, 2 * LONGEST) or None
-        ax.errorbar(place, value, error, fmt="o", markersize=3.5, capsize=2, linewidth=1, color=colour, label=label)
+        ax.errorbar(
+            place,
+            value,
+            error,
+            fmt="o",
+            markersize=3.5,
+            capsize=2,
+            linewidth=1,
+            color=colour,
+            label=label,
+        )
     ax.set_ylabel(textwrap.fill(in_words(rows[0]["quantity"], rows[0]["unit"]), 18))
     if by == "group":
         ax.set_xticks(range(len(groups)) if _short(groups) else [])
         if _short(groups):
-            ax.set_xticklabels([named(group, LONGEST) or "all" for group in groups], parse_math=False)
+            ax.set_xticklabels(
+                [named(group, LONGEST) or "all" for group in groups], parse_math=False
+            )
         ax.set_xlim(-0.6, len(groups) - 0.4)
     elif by == "level":
         ax.set_xlabel("Level (% MVC)")
@@ -144,6 +195,13 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
         if len(people) <= LABELLED:
             turned = 35 if len(people) <= 6 else 60
             labels = [named(name, LONGEST) for name in people]
-            ax.set_xticks(range(len(people)), labels, rotation=turned, ha="right", rotation_mode="anchor", parse_math=False)
+            ax.set_xticks(
+                range(len(people)),
+                labels,
+                rotation=turned,
+                ha="right",
+                rotation_mode="anchor",
+                parse_math=False,
+            )
         else:
             ax.set_xlabel("Target number")

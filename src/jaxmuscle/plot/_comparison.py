@@ -1,4 +1,5 @@
-"""The figure of a comparison of noises: how the best of each fits, and whether they can be told apart."""
+"""The figure of a comparison of noises: how the best of each fits, and whether they can be told
+apart."""
 
 from typing import Any
 
@@ -7,7 +8,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._spectra import target
-from ._style import COLUMN, GREY, PALETTE, canvas, fitted_to, heading, ink, key, log_axis, shade, styled, without_legend
+from ._style import (
+    COLUMN,
+    GREY,
+    PALETTE,
+    canvas,
+    fitted_to,
+    heading,
+    ink,
+    key,
+    log_axis,
+    shade,
+    styled,
+    without_legend,
+)
 
 SPECTRA, ROW = 2.4, 0.24  # inches
 MARK: dict[str, Any] = {"ms": 5.5, "zorder": 3}
@@ -41,7 +55,12 @@ def _spectra(ax: Axes, comparison: Any, colours: dict[str, str]) -> None:
     frequency, power = comparison.target.frequency, comparison.target.proportional_power
     for number, noise in enumerate(comparison.noises):
         best = comparison.of(noise)
-        style = {"color": colours[noise], "ls": DASHES[number % len(DASHES)], "lw": 1.3, "zorder": 5 - 0.1 * number}
+        style = {
+            "color": colours[noise],
+            "ls": DASHES[number % len(DASHES)],
+            "lw": 1.3,
+            "zorder": 5 - 0.1 * number,
+        }
         ax.plot(frequency, comparison.fitted[noise, best.harmonic], label=best.label, **style)
     ax.set(title="Best fit of each noise", ylim=(0.5 * power.min(), 2 * power.max()))
     log_axis(ax, "y")
@@ -57,7 +76,12 @@ def _criterion(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
         for name, face in (("with harmonic", GREY), ("without", "none")):
             ax.plot([], [], "o", color=GREY, mfc=face, label=name, **MARK)
         ax.legend(
-            loc="lower right", bbox_to_anchor=(1.02, 1.0), ncols=2, borderaxespad=0.0, columnspacing=0.8, handletextpad=0.1
+            loc="lower right",
+            bbox_to_anchor=(1.02, 1.0),
+            ncols=2,
+            borderaxespad=0.0,
+            columnspacing=0.8,
+            handletextpad=0.1,
         )
     _rows(ax, [row.noise for row in rows])
     near = any(row.delta_aic < row.needed for row in rows[1:])
@@ -66,24 +90,52 @@ def _criterion(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
 
 
 def _span(rows: list[Any]) -> float:
-    return max(1.6 * rows[0].needed, 1.1 * max((row.delta_aic for row in rows if np.isfinite(row.delta_aic)), default=0.0))
+    return max(
+        1.6 * rows[0].needed,
+        1.1 * max((row.delta_aic for row in rows if np.isfinite(row.delta_aic)), default=0.0),
+    )
 
 
 def _scores(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
-    """Held-out score minus that of the model of lowest AIC; none of a search that did not come to its end."""
+    """Held-out score minus that of the model of lowest AIC; none of a search that did not come to
+    its end."""
     _rows(ax, [""] * len(rows))
     if rows[0].scores is None:
         ax.set(xticks=[])
-        ax.text(0.5, 0.5, "no bins left out:\nno segments", transform=ax.transAxes, ha="center", va="center", color=GREY)
+        ax.text(
+            0.5,
+            0.5,
+            "no bins left out:\nno segments",
+            transform=ax.transAxes,
+            ha="center",
+            va="center",
+            color=GREY,
+        )
         return
     ax.axvline(0, color=ink(), lw=0.6, zorder=1)
     for i, row in enumerate(rows):
         if not row.success:
-            ax.text(0.02, i, "not converged", transform=ax.get_yaxis_transform(), va="center", color=GREY)
+            ax.text(
+                0.02,
+                i,
+                "not converged",
+                transform=ax.get_yaxis_transform(),
+                va="center",
+                color=GREY,
+            )
             continue
         error = row.score_stderr or None
-        ax.errorbar(row.score_difference, i, xerr=error, fmt="o", capsize=2, lw=1, color=colours[row.noise],
-                    mfc=_face(row, colours), **MARK)  # fmt: skip
+        ax.errorbar(
+            row.score_difference,
+            i,
+            xerr=error,
+            fmt="o",
+            capsize=2,
+            lw=1,
+            color=colours[row.noise],
+            mfc=_face(row, colours),
+            **MARK,
+        )
     ax.set_xlabel("Held-out score minus that\nof the lowest AIC (± SE)")
 
 

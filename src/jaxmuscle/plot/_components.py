@@ -1,4 +1,5 @@
-"""What the parts of the model hold of the fitted power: in the figure of a fit, and as a figure of its own."""
+"""What the parts of the model hold of the fitted power: in the figure of a fit, and as a figure of
+its own."""
 
 from typing import Any
 
@@ -17,7 +18,11 @@ PARTS = {
     "tremor": (GREEN, "tremor (all bins)"),
     "resonance_2": (PURPLE, "resonance 2 (all bins)"),
 }
-RHYTHMS = {"harmonic": "harmonic", "tremor": "tremor in the drive", "resonance_2": "resonance 2 in the drive"}
+RHYTHMS = {
+    "harmonic": "harmonic",
+    "tremor": "tremor in the drive",
+    "resonance_2": "resonance 2 in the drive",
+}
 LEAST = 1e-4  # share of the power below which a part is not drawn
 DECADE = 10.0  # by which a part may lie below the spectrum to be seen
 
@@ -31,36 +36,64 @@ def parts_of_power(ax: Axes, part: Any, *, log: bool, named: bool = True) -> Non
         total = float(np.sum(power))
         if not total > LEAST:
             continue
-        label = f"{words}, {'<1' if total < 0.01 else f'{100 * total:.0f}'} % of power" if named else None
+        label = (
+            f"{words}, {'<1' if total < 0.01 else f'{100 * total:.0f}'} % of power"
+            if named
+            else None
+        )
         if log:
-            ax.plot(frequency, np.where(power > 0, power, np.nan), color=color, lw=1.0, zorder=3, label=label)
+            ax.plot(
+                frequency,
+                np.where(power > 0, power, np.nan),
+                color=color,
+                lw=1.0,
+                zorder=3,
+                label=label,
+            )
             continue
-        ax.fill_between(frequency, below, below + power, color=color, alpha=0.7, lw=0, zorder=2, label=label)
+        ax.fill_between(
+            frequency, below, below + power, color=color, alpha=0.7, lw=0, zorder=2, label=label
+        )
         below = below + power
 
 
 def lowest(part: Any, seen: float) -> float:
-    """How far a logarithmic axis goes down from `seen`, the least power: all parts show, at most a decade below."""
+    """How far a logarithmic axis goes down from `seen`, the least power: all parts show, at most a
+    decade below."""
     powers = [_power_of(part, name) for name in PARTS]
     peaks = [float(np.max(power)) / 2 for power in powers if float(np.sum(power)) > LEAST]
     return max(min([seen, *peaks]), seen / DECADE)
 
 
 def rhythms(ax: Axes, part: Any) -> None:
-    """Marks the frequency of every rhythm that has power: of a resonance that in the drive, above its hill in the force."""
+    """Marks the frequency of every rhythm that has power: of a resonance that in the drive, above
+    its hill in the force."""
     resonances = [noise for noise in part.task.noise.components if noise.sort == "resonance"]
-    for (name, words), rhythm in zip(RHYTHMS.items(), (part.task.harmonic, *resonances), strict=False):
+    for (name, words), rhythm in zip(
+        RHYTHMS.items(), (part.task.harmonic, *resonances), strict=False
+    ):
         if np.sum(_power_of(part, name)) > LEAST:
             where = float(rhythm.frequency)
             mark(ax, part, where, PARTS[name][0], f"{words}: {where:.2f} Hz")
 
 
 def mark(ax: Axes, part: Any, where: float, color: str, label: str) -> None:
-    """A triangle at the foot of the axes and a dashed line; of a frequency outside the bins the label alone."""
+    """A triangle at the foot of the axes and a dashed line; of a frequency outside the bins the
+    label alone."""
     frequency = np.asarray(part.frequency_hz)
     inside = frequency[0] / 2 <= where <= frequency[-1] * 1.05
-    ax.plot([where] if inside else [], [0.03] if inside else [], color=color, marker="^", ms=5, lw=0, label=label,
-            transform=ax.get_xaxis_transform(), clip_on=False, zorder=5)  # fmt: skip
+    ax.plot(
+        [where] if inside else [],
+        [0.03] if inside else [],
+        color=color,
+        marker="^",
+        ms=5,
+        lw=0,
+        label=label,
+        transform=ax.get_xaxis_transform(),
+        clip_on=False,
+        zorder=5,
+    )
     if inside:
         ax.axvline(where, color=color, lw=0.8, ls=(0, (4, 2)), zorder=0)
 
@@ -71,12 +104,15 @@ def _power_of(part: Any, name: str) -> Any:
 
 
 @styled
-def components(result: Any, ax: Axes | None = None, target: str | None = None, *, log: bool = True) -> Axes:
+def components(
+    result: Any, ax: Axes | None = None, target: str | None = None, *, log: bool = True
+) -> Axes:
     """Draws what the parts of the model hold of the fitted power: they add up to the fit.
 
-    The floor is from noise on the passive tissue, the relaxation from noise on the active one. Harmonic, tremor and second
-    resonance are drawn where the model has them. Those of the two resonances hold all of their power, also that far below
-    their peaks; a result's `tremor_share` counts from half the tremor's frequency on.
+    The floor is from noise on the passive tissue, the relaxation from noise on the active one.
+    Harmonic, tremor and second resonance are drawn where the model has them. Those of the two
+    resonances hold all of their power, also that far below their peaks; a result's `tremor_share`
+    counts from half the tremor's frequency on.
 
     **Arguments:**
 
@@ -87,7 +123,8 @@ def components(result: Any, ax: Axes | None = None, target: str | None = None, *
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` for an unknown target, and where the parts are not known (no spectrum, or no linear response).
+    **Raises:** `ValueError` for an unknown target, and where the parts are not known (no spectrum,
+    or no linear response).
     """
     if target is not None and target not in result.parts:
         raise ValueError(f"target = {target!r}: {choices(target, result.parts)}")
@@ -95,8 +132,10 @@ def components(result: Any, ax: Axes | None = None, target: str | None = None, *
         raise ValueError(f"a fit of several targets: give target= one of {', '.join(result.parts)}")
     part = next(iter(result.parts.values())) if target is None else result.parts[target]
     if not part.components:
-        raise ValueError(f"{part.target.name}: the parts of the power are not known: the fit has no linear response, or the "
-                         "target no spectrum")  # fmt: skip
+        raise ValueError(
+            f"{part.target.name}: the parts of the power are not known: the fit has no linear"
+            " response, or the target no spectrum"
+        )
     ax = axes_or_new(ax)
     draw_target(part.target, ax, log=log)
     dots, fitted = ax.lines[0], np.asarray(part.fitted)
@@ -108,5 +147,7 @@ def components(result: Any, ax: Axes | None = None, target: str | None = None, *
         ax.set_ylim(seen[seen > 0].min() / DECADE, 1.5 * seen.max())
         log_axis(ax, "y")
     ax.set_title(part.target.name, parse_math=False)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, frameon=False, columnspacing=1.2)
+    ax.legend(
+        loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, frameon=False, columnspacing=1.2
+    )
     return ax

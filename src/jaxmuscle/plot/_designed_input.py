@@ -16,11 +16,13 @@ NOW, FLAT, DESIGNED = "now, without this record", "flat motion", "designed motio
 
 @styled
 def designed_input(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws a designed motion: its density, its beginning, and the standard errors that are expected with it.
+    """Draws a designed motion: its density, its beginning, and the standard errors that are
+    expected with it.
 
-    The flat motion beside it has the same density at all frequencies of the band, and is as large as the same limits allow;
-    it stands alone where the motion is flat itself. A dashed line is the error that was asked for.
-    Errors are in percent of the value, of one record. Letters are legible in a column of 85 mm.
+    The flat motion beside it has the same density at all frequencies of the band, and is as large
+    as the same limits allow; it stands alone where the motion is flat itself. A dashed line is the
+    error that was asked for. Errors are in percent of the value, of one record. Letters are legible
+    in a column of 85 mm.
     """
     heights = HEIGHTS[0], HEIGHTS[1], 0.75 + ROW * len(found.told)
     fig = canvas(ax, (COLUMN, sum(heights)))
@@ -29,7 +31,11 @@ def designed_input(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     shown = found.time <= SHOWN
     motion.plot(found.time[shown], 1e3 * found.displacement[shown], color=BLUE, lw=0.9)
     motion.axhline(0, color=GREY, lw=0.5)
-    motion.set(xlabel="Time (s)", ylabel="Lengthening (mm)", xlim=(0, min(SHOWN, found.lengthening.seconds)))
+    motion.set(
+        xlabel="Time (s)",
+        ylabel="Lengthening (mm)",
+        xlim=(0, min(SHOWN, found.lengthening.seconds)),
+    )
     name = _label(found).capitalize()
     motion.set_title(f"{name}, its first {SHOWN:g} s" if found.time[-1] > SHOWN else name)
     _errors(errors, found)
@@ -43,8 +49,17 @@ def _label(found: Any) -> str:
 
 
 def _density(ax: Axes, found: Any) -> None:
-    for lines, colour, label in [(found.even, GREY, FLAT)] * bool(found.moves) + [(found.lengthening, BLUE, _label(found))]:
-        ax.step(found.frequency, 1e6 * lines.power * lines.seconds, where="mid", color=colour, lw=1.2, label=label)
+    for lines, colour, label in [(found.even, GREY, FLAT)] * bool(found.moves) + [
+        (found.lengthening, BLUE, _label(found))
+    ]:
+        ax.step(
+            found.frequency,
+            1e6 * lines.power * lines.seconds,
+            where="mid",
+            color=colour,
+            lw=1.2,
+            label=label,
+        )
     log_axis(ax)
     low, high = ax.dataLim.intervaly
     if high < LEAST * low:
@@ -57,11 +72,17 @@ def _errors(ax: Axes, found: Any) -> None:
     """A row for each quantity, a mark for each way to measure it."""
     names = found.told
     flat = [(found.flat, GREY, "s", FLAT)] * bool(found.moves)
-    for known, colour, marker, label in [(found.now, ORANGE, "D", NOW), *flat, (found.stderr, BLUE, "o", _label(found))]:
+    for known, colour, marker, label in [
+        (found.now, ORANGE, "D", NOW),
+        *flat,
+        (found.stderr, BLUE, "o", _label(found)),
+    ]:
         size = [found.percent(name, known) for name in names]
         ax.plot(size, np.arange(len(names)), marker, ms=4.5, color=colour, label=label, zorder=3)
     if found.needed is not None:
-        ax.axvline(100 * found.needed[0], color=shade(0.6), lw=0.8, ls="--", label="error asked for")
+        ax.axvline(
+            100 * found.needed[0], color=shade(0.6), lw=0.8, ls="--", label="error asked for"
+        )
     ax.set_yticks(range(len(names)), names)
     ax.set_ylim(len(names) - 0.4, -0.6)
     log_axis(ax)

@@ -1,4 +1,5 @@
-"""The figure of a fit, for `jaxmuscle.plot.fit`: spectra, residuals and output; words and numbers are the result's."""
+"""The figure of a fit, for `jaxmuscle.plot.fit`: spectra, residuals and output; words and numbers
+are the result's."""
 
 import math
 from collections.abc import Callable
@@ -40,12 +41,14 @@ DARK_GREEN = "#00664A"  # the palette's green is too light for small letters
 
 @styled
 def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws what a fit found: spectra linear and logarithmic, residuals, simulated output, the harmonic's profile.
+    """Draws what a fit found: spectra linear and logarithmic, residuals, simulated output, the
+    harmonic's profile.
 
-    The band around the target is that of `target`. The fit is the mean of new simulations, where there are some. Residuals
-    are in standard deviations of the log power, positive where the target is above the fit; those beyond two are red. χ² and
-    p above them are those of the verdict. Letters are legible in a column of 85 mm. Numbers,
-    notices and what the data do not determine are what `print(result)` tells.
+    The band around the target is that of `target`. The fit is the mean of new simulations, where
+    there are some. Residuals are in standard deviations of the log power, positive where the target
+    is above the fit; those beyond two are red. χ² and p above them are those of the verdict.
+    Letters are legible in a column of 85 mm. Numbers, notices and what the data do not determine
+    are what `print(result)` tells.
 
     **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`, its place. **Returns:** the figure.
     """
@@ -66,7 +69,13 @@ def _title(fig: Figure | SubFigure, result: Any) -> int:
     name = named(name, 50)
     if any(part.target.provenance == "reconstructed" for part in result.parts.values()):
         name += " (reconstructed)"
-    bad = "Not fitted" if not result.success else "Does not describe the data" if result.adequate is False else ""
+    bad = (
+        "Not fitted"
+        if not result.success
+        else "Does not describe the data"
+        if result.adequate is False
+        else ""
+    )
     return heading(fig, name, bad=bad)
 
 
@@ -78,15 +87,41 @@ def _panels(result: Any) -> list[tuple[float, tuple[Panel, ...]]]:
     parts = result.parts
     if len(parts) > 1:
         rows: list[tuple[float, tuple[Panel, ...]]] = [
-            (1.7, (partial(_spectra, part=part, log=True, title=f"{name}: {type(part.task).__name__}"),
-                   partial(_residuals, part=part))) for name, part in parts.items() if part.fitted.size]  # fmt: skip
-        return rows + [row for name, part in parts.items() for row in _moved(part, f"{name}: dynamic stiffness")]
+            (
+                1.7,
+                (
+                    partial(
+                        _spectra, part=part, log=True, title=f"{name}: {type(part.task).__name__}"
+                    ),
+                    partial(_residuals, part=part),
+                ),
+            )
+            for name, part in parts.items()
+            if part.fitted.size
+        ]
+        return rows + [
+            row
+            for name, part in parts.items()
+            for row in _moved(part, f"{name}: dynamic stiffness")
+        ]
     part = result.only
-    rows = [
-        (1.75, (partial(_spectra, part=part, log=False), partial(_spectra, part=part, log=True))),
-        (1.4, (partial(_residuals, part=part, verdict=(result.closeness, result.adequacy_p)),
-               partial(_stretch, part=part, relative=bool(result.per_newton)))),
-    ] if part.fitted.size else []  # fmt: skip
+    rows = (
+        [
+            (
+                1.75,
+                (partial(_spectra, part=part, log=False), partial(_spectra, part=part, log=True)),
+            ),
+            (
+                1.4,
+                (
+                    partial(_residuals, part=part, verdict=(result.closeness, result.adequacy_p)),
+                    partial(_stretch, part=part, relative=bool(result.per_newton)),
+                ),
+            ),
+        ]
+        if part.fitted.size
+        else []
+    )
     rows += _moved(part, "Dynamic stiffness")
     return rows if result.profile is None else [*rows, (1.2, (partial(_profile, result=result),))]
 
@@ -96,9 +131,16 @@ def _moved(part: Any, title: str) -> list[tuple[float, tuple[Panel, ...]]]:
     if part.stiffness is None:
         return []
     measured, fitted = part.target.stiffness.known, ("fit", part.stiffness)
-    return [(1.9, (partial(_gain, response=measured, curve=fitted, title=title),
-                   partial(_phase, response=measured, curve=fitted))),
-            (1.5, (partial(stiffness_residuals, part=part),))]  # fmt: skip
+    return [
+        (
+            1.9,
+            (
+                partial(_gain, response=measured, curve=fitted, title=title),
+                partial(_phase, response=measured, curve=fitted),
+            ),
+        ),
+        (1.5, (partial(stiffness_residuals, part=part),)),
+    ]
 
 
 def _gain(ax: Axes, response: Any, curve: Any, title: str) -> None:
@@ -158,13 +200,22 @@ def _harmonic(ax: Axes, part: Any, frequency: Any, fitted: Any) -> None:
         return
     percent = "<0.1" if total < 1e-3 else f"{100 * total:.2g}"
     held = fitted * share > 0
-    ax.fill_between(frequency, fitted * (1 - share), fitted, where=held | np.roll(held, 1) | np.roll(held, -1),
-                    color=ORANGE, alpha=0.7, lw=0, zorder=2)  # fmt: skip
+    ax.fill_between(
+        frequency,
+        fitted * (1 - share),
+        fitted,
+        where=held | np.roll(held, 1) | np.roll(held, -1),
+        color=ORANGE,
+        alpha=0.7,
+        lw=0,
+        zorder=2,
+    )
     mark(ax, part, where, ORANGE, f"harmonic: {where:.2f} Hz, {percent} % of power")
 
 
 def _residuals(ax: Axes, part: Any, verdict: tuple[str, float | None] = ("", None)) -> None:
-    """Bars, with the range that one and two standard deviations cover if these are known; how close the fit is."""
+    """Bars, with the range that one and two standard deviations cover if these are known; how close
+    the fit is."""
     frequency, residual = np.asarray(part.frequency_hz), np.asarray(part.residual)
     known = part.deviation is not None
     outside = np.abs(residual) > 2 if known else np.zeros(residual.shape, bool)
@@ -176,7 +227,10 @@ def _residuals(ax: Axes, part: Any, verdict: tuple[str, float | None] = ("", Non
         drawn[first].set_label("residual beyond 2 SD")
     _closeness(ax, part, *verdict)
     ax.set(xlabel="Frequency (Hz)", xlim=(0, frequency[-1] + frequency[0]))
-    reach = float(np.max(np.abs(residual), where=np.isfinite(residual), initial=3.0 if known else 0.1)) * 1.1
+    reach = (
+        float(np.max(np.abs(residual), where=np.isfinite(residual), initial=3.0 if known else 0.1))
+        * 1.1
+    )
     ax.set(ylim=(-reach, reach), ylabel="Residual (SD)" if known else "Residual (ln units)")
     if known:
         for deviations, grey in ((2, 0.06), (1, 0.13)):
@@ -187,8 +241,13 @@ def _residuals(ax: Axes, part: Any, verdict: tuple[str, float | None] = ("", Non
 
 
 def _closeness(ax: Axes, part: Any, said: str, p: float | None) -> None:
-    """The verdict of the fit with its χ²; of one target among several the χ² of the line that is drawn."""
-    own = "no χ² (spread unknown)" if part.chi2_per_bin is None else f"χ² per bin {part.chi2_per_bin:.2f}"
+    """The verdict of the fit with its χ²; of one target among several the χ² of the line that is
+    drawn."""
+    own = (
+        "no χ² (spread unknown)"
+        if part.chi2_per_bin is None
+        else f"χ² per bin {part.chi2_per_bin:.2f}"
+    )
     words = own if p is None else f"{said.replace('chi2', 'χ²')}, {probability(p)}"
     green = DARK_GREEN if shade(0.0) > shade(1.0) else GREEN
     color = ink() if p is None else green if p >= 0.01 else VERMILLION
@@ -196,7 +255,8 @@ def _closeness(ax: Axes, part: Any, said: str, p: float | None) -> None:
 
 
 def _stretch(ax: Axes, part: Any, relative: bool) -> None:
-    """A simulated path; `relative` to its mean, where the data do not tell how many newtons that is."""
+    """A simulated path; `relative` to its mean, where the data do not tell how many newtons that
+    is."""
     task = part.task
     time, output = map(np.asarray, part.stretch or ((), ()))
     label = "Force / mean" if relative else output_label(task.output_name, task.output_unit)
@@ -219,12 +279,19 @@ def _profile(ax: Axes, result: Any) -> None:
     allowed = f"Δχ² < {ALLOWED:g}: in the 95 % interval"
     ax.axhspan(0, ALLOWED, color=shade(0.1), lw=0, zorder=0, label=allowed)
     ax.plot(frequency, rise, color=BLUE, marker=".", ms=3)
-    ax.axvline(float(result.task["harmonic_frequency"]), color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
+    ax.axvline(
+        float(result.task["harmonic_frequency"]), color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0
+    )
     ax.set_title("Profile of the harmonic's frequency")
     if result.harmonic_p_value is not None:
         ax.set_title(f"harmonic p = {result.harmonic_p_value:.2g}", loc="right", weight="normal")
     top = float(np.max(rise, where=np.isfinite(rise), initial=2 * ALLOWED))
-    ax.set(xlabel="Frequency (Hz)", ylabel="Δχ²", xlim=(0, frequency[-1] + frequency[0]), ylim=(0, 1.05 * top))
+    ax.set(
+        xlabel="Frequency (Hz)",
+        ylabel="Δχ²",
+        xlim=(0, frequency[-1] + frequency[0]),
+        ylim=(0, 1.05 * top),
+    )
 
 
 def _say(ax: Axes, message: str, color: str = VERMILLION) -> None:

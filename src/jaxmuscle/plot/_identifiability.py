@@ -1,4 +1,5 @@
-"""The figure of an identifiability report: singular values, and what each further measurement leaves of every error."""
+"""The figure of an identifiability report: singular values, and what each further measurement
+leaves of every error."""
 
 import textwrap
 from typing import Any
@@ -7,28 +8,49 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._style import BLUE, COLUMN, GREY, VERMILLION, canvas, fitted_to, heading, key, log_axis, shade, styled
+from ._style import (
+    BLUE,
+    COLUMN,
+    GREY,
+    VERMILLION,
+    canvas,
+    fitted_to,
+    heading,
+    key,
+    log_axis,
+    shade,
+    styled,
+)
 
 TEXT, DOTS, ROW = 0.14, 0.15, 0.2  # inches: a line of words, its dots, a row of the table
 NAMES, CELL = 1.3, 0.28  # inches: the names of quantities, the narrowest column
 LEAST, EDGE = 1e-2, 5e-3
 WRAP, WIDEST = 60, 20  # letters
 PAIRS = 3
-PALE = -0.6  # share of the prior's error at which the colours would begin: black is read on all that are left
+# share of the prior's error at which the colours would begin: black is read on all that are left
+PALE = -0.6
 
 
 @styled
 def identifiability(report: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws singular values and standard errors, now and with each further measurement.
 
-    Above, the singular values of the Jacobian, one for each direction of the parameters: filled where the data determine it,
-    open where they do not. Values that are smaller than the axis are counted at its left end. Below, the standard errors
-    that data and prior leave; those of the shares by band are in the table alone. Letters are legible in a column of 85 mm,
-    as far as ten measurements.
+    Above, the singular values of the Jacobian, one for each direction of the parameters: filled
+    where the data determine it, open where they do not. Values that are smaller than the axis are
+    counted at its left end. Below, the standard errors that data and prior leave; those of the
+    shares by band are in the table alone. Letters are legible in a column of 85 mm, as far as ten
+    measurements.
     """
     letters = {d.name: report.letter(i) for i, d in enumerate(report.designs)}
-    shown = [report.present, *(d for d in report.designs if d.failed is None), *report.telling_pairs[:PAIRS]]
-    marks = ["now", *(" + ".join(letters[name] for name in o.name.split(report.together)) for o in shown[1:])]
+    shown = [
+        report.present,
+        *(d for d in report.designs if d.failed is None),
+        *report.telling_pairs[:PAIRS],
+    ]
+    marks = [
+        "now",
+        *(" + ".join(letters[name] for name in o.name.split(report.together)) for o in shown[1:]),
+    ]
     labels = [_label(mark, o.name) for mark, o in zip(marks, shown, strict=True)]
     lines = sum(label.count("\n") + 1 for label in labels)
     names = [name for name in report.told if not name.startswith("band_")]  # these are in the table
@@ -49,7 +71,8 @@ def _label(mark: str, name: str) -> str:
 
 
 def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: float) -> None:
-    """Words and a row of dots for each design: filled where determined, counted at the edge where smaller than the axis."""
+    """Words and a row of dots for each design: filled where determined, counted at the edge where
+    smaller than the axis."""
     top = EDGE, threshold, *(float(o.singular_values.max()) for o in shown)
     ax.axvspan(EDGE, threshold, color=shade(0.06), lw=0, zorder=0)
     open_: dict[str, Any] = {"facecolor": "none", "edgecolor": VERMILLION, "zorder": 3}
@@ -62,12 +85,17 @@ def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: f
         ax.text(0.0, row, label, va="top", **words)
         ax.text(1.0, row, f"{known.sum()} of {len(size)}", va="top", ha="right", **words)
         ax.axhline(at, color=shade(0.2), lw=0.5, zorder=0)
-        ax.vlines(threshold, at - 0.5 * DOTS, at + 0.5 * DOTS, color=GREY, lw=0.8, zorder=1)  # not through the words
-        ax.scatter(size[known], np.full(known.sum(), at), s=18, color=BLUE, label="determined", zorder=3)
+        # not through the words
+        ax.vlines(threshold, at - 0.5 * DOTS, at + 0.5 * DOTS, color=GREY, lw=0.8, zorder=1)
+        ax.scatter(
+            size[known], np.full(known.sum(), at), s=18, color=BLUE, label="determined", zorder=3
+        )
         some = ~known & ~tiny
         ax.scatter(size[some], np.full(some.sum(), at), s=18, label="not determined", **open_)
         if tiny.any():
-            ax.scatter([1.15 * EDGE], [at], s=18, marker="<", label=f"how many below {LEAST:g}", **open_)
+            ax.scatter(
+                [1.15 * EDGE], [at], s=18, marker="<", label=f"how many below {LEAST:g}", **open_
+            )
             ax.text(1.35 * EDGE, at, f"{tiny.sum()}", va="center", color=VERMILLION, zorder=3)
         row = at + 0.65 * DOTS
     ax.set(xlim=(EDGE, 1.6 * max(top)), ylim=(row + 0.02, -0.02), yticks=[])
@@ -77,8 +105,11 @@ def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: f
     ax.spines["left"].set_visible(False)
 
 
-def _matrix(ax: Axes, shown: list[Any], marks: list[str], names: list[str], doubted: tuple[str, ...]) -> None:
-    """Colour: share of the prior's standard deviation that is left. Number: standard error; bold: determined.
+def _matrix(
+    ax: Axes, shown: list[Any], marks: list[str], names: list[str], doubted: tuple[str, ...]
+) -> None:
+    """Colour: share of the prior's standard deviation that is left. Number: standard error; bold:
+    determined.
 
     In the first column, the present data, that is as the fit has it: what it doubts is not bold.
     """
@@ -91,10 +122,23 @@ def _matrix(ax: Axes, shown: list[Any], marks: list[str], names: list[str], doub
             known = outlook.quantities[name]
             number, _, unit = known.percent.partition(" ")
             sure = known.determined and (j > 0 or name not in doubted)
-            ax.text(j, i, number, ha="center", va="center", color="black", weight="bold" if sure else "normal")
+            ax.text(
+                j,
+                i,
+                number,
+                ha="center",
+                va="center",
+                color="black",
+                weight="bold" if sure else "normal",
+            )
         labels.append(_wrapped(name) + (f" ({unit})" if unit != "%" else ""))
     ax.set_yticks(range(len(names)), labels, linespacing=0.9)
-    ax.set_xticks(range(len(shown)), [mark.replace(" + ", "\n+") for mark in marks], weight="bold", linespacing=0.95)
+    ax.set_xticks(
+        range(len(shown)),
+        [mark.replace(" + ", "\n+") for mark in marks],
+        weight="bold",
+        linespacing=0.95,
+    )
     ax.set_xticks(np.arange(len(shown) + 1) - 0.5, minor=True)
     ax.set_yticks(np.arange(len(names) + 1) - 0.5, minor=True)
     ax.grid(which="minor", color="white", lw=1.5)

@@ -8,7 +8,8 @@ from jaxmuscle._common.text import rounded
 
 
 def quantity(estimate: Any) -> tuple[str, str, str]:
-    """Value, standard error and unit of an estimate in print: the error to two digits, the value to as many places."""
+    """Value, standard error and unit of an estimate in print: the error to two digits, the value to
+    as many places."""
     value, stderr = float(estimate.value), estimate.stderr
     if not math.isfinite(value):
         return "not finite", "", unit_in_print(estimate.unit)
@@ -28,7 +29,8 @@ DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def number_in_print(value: float) -> str:
-    """A number of an axis: `20`, `0.0005`, `5e−5`. A raised exponent would be too small in a column of 85 mm."""
+    """A number of an axis: `20`, `0.0005`, `5e−5`. A raised exponent would be too small in a column
+    of 85 mm."""
     digits, _, power = f"{value:g}".partition("e")
     return f"{digits}e{int(power)}".replace("-", "\N{MINUS SIGN}") if power else digits
 

@@ -8,7 +8,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._stiffness import POINTS, Curve, gain, phase
-from ._style import BLUE, COLUMN, GREY, ORANGE, VERMILLION, canvas, fitted_to, heading, ink, key, legend, styled
+from ._style import (
+    BLUE,
+    COLUMN,
+    GREY,
+    ORANGE,
+    VERMILLION,
+    canvas,
+    fitted_to,
+    heading,
+    ink,
+    key,
+    legend,
+    styled,
+)
 
 SHOWN = 4.0  # seconds of the window that are drawn larger
 CHANCE = 0.05
@@ -16,9 +29,11 @@ CHANCE = 0.05
 
 @styled
 def frequency_response(response: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws a frequency response: gain and phase with two standard errors either way, and the coherence.
+    """Draws a frequency response: gain and phase with two standard errors either way, and the
+    coherence.
 
-    If the force did not follow the displacement, 5 % of the bins would have a coherence above the dashed line.
+    If the force did not follow the displacement, 5 % of the bins would have a coherence above the
+    dashed line.
     """
     heights = (1.7, 1.2, 1.3)
     fig = canvas(ax, (COLUMN, sum(heights)))
@@ -31,17 +46,21 @@ def frequency_response(response: Any, ax: Axes | None = None) -> Figure | SubFig
 
 @styled
 def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws a recording of force and displacement: both with the window, four seconds of it larger, and the response.
+    """Draws a recording of force and displacement: both with the window, four seconds of it larger,
+    and the response.
 
-    The response has its spring, damper and mass (`PerturbedRecording.second_order`) as a line. `settings`:
-    `SpectrumSettings` or a name, as of `Recording.spectrum`.
+    The response has its spring, damper and mass (`PerturbedRecording.second_order`) as a line.
+    `settings`: `SpectrumSettings` or a name, as of `Recording.spectrum`.
     """
     heights = (1.2, 1.3, 1.5, 1.1, 1.2)
     fig = canvas(ax, (COLUMN, sum(heights)))
     halves = sum(heights[:2]), sum(heights[2:])
     upper, lower = fig.subfigures(2, 1, squeeze=False, height_ratios=halves)[:, 0]
     traces, closer = upper.subplots(2, 2, sharex="col", sharey="row", width_ratios=(1.6, 1)).T
-    channels = ((recording.force, 1.0, "Force (N)", BLUE), (recording.displacement, 1e3, "Lengthening (mm)", VERMILLION))
+    channels = (
+        (recording.force, 1.0, "Force (N)", BLUE),
+        (recording.displacement, 1e3, "Lengthening (mm)", VERMILLION),
+    )
     for whole, near, (channel, scale, label, colour) in zip(traces, closer, channels, strict=True):
         time = channel.start + np.arange(channel.whole.size) / channel.rate
         whole.plot(time, scale * channel.whole, color=colour, lw=0.5)
@@ -67,19 +86,28 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     return fig
 
 
-def _response(panels: Sequence[Axes] | np.ndarray, response: Any, line: Curve | None = None) -> None:
+def _response(
+    panels: Sequence[Axes] | np.ndarray, response: Any, line: Curve | None = None
+) -> None:
     f, coherence = response.frequency, panels[2]
     gain(panels[0], response, line)
     phase(panels[1], response, line)
     if response.coherence is None:
-        coherence.text(0.5, 0.5, "no coherence stated", ha="center", transform=coherence.transAxes, color=GREY)
+        coherence.text(
+            0.5, 0.5, "no coherence stated", ha="center", transform=coherence.transAxes, color=GREY
+        )
     else:
         k = np.maximum(response.averages, 2.0)
         spread = np.sqrt(2 * response.coherence / k) * (1 - response.coherence)
-        ends = [np.minimum(2 * spread, response.coherence), np.minimum(2 * spread, 1 - response.coherence)]
+        ends = [
+            np.minimum(2 * spread, response.coherence),
+            np.minimum(2 * spread, 1 - response.coherence),
+        ]
         coherence.errorbar(f, response.coherence, np.nan_to_num(ends), color=ink(), **POINTS)
         chance = 1 - CHANCE ** (1 / (np.maximum(k - 1, 1)))
-        coherence.plot(f, chance, color=GREY, lw=0.8, ls="--", label=f"by chance {100 * CHANCE:g} % lie above")
+        coherence.plot(
+            f, chance, color=GREY, lw=0.8, ls="--", label=f"by chance {100 * CHANCE:g} % lie above"
+        )
         legend(coherence, "above")
     coherence.set_ylim(0, 1.03)
     coherence.set_ylabel("Coherence γ²")

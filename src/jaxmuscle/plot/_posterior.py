@@ -28,7 +28,13 @@ from ._style import (
     styled,
 )
 
-ORDER = ("corner_frequency", "harmonic_frequency", "harmonic_share", "high_frequency_floor", "coefficient_of_variation")
+ORDER = (
+    "corner_frequency",
+    "harmonic_frequency",
+    "harmonic_share",
+    "high_frequency_floor",
+    "coefficient_of_variation",
+)
 MOST, PAIRS = 6, 4  # quantities that are drawn; those of which all pairs have room in a column
 CUT = (0.002, 0.998)
 BANDS = ((0.025, 0.975, 0.18), (0.25, 0.75, 0.35))
@@ -37,10 +43,13 @@ REGIONS = ("#cfe6f5", SKY, BLUE)  # of this mass
 
 
 def chosen(found: Any) -> list[str]:
-    """What a corner figure shows: the quantities that the data determine, and the harmonic's frequency."""
+    """What a corner figure shows: the quantities that the data determine, and the harmonic's
+    frequency."""
     told = {n: n.partition("@")[0] for n in found.quantities}
     free = {n for n in found.samples if told[n] == "harmonic_frequency"}
-    names = [n for n, base in told.items() if base in ORDER and (n in found.determined or n in free)]
+    names = [
+        n for n, base in told.items() if base in ORDER and (n in found.determined or n in free)
+    ]
     names.sort(key=lambda n: ORDER.index(told[n]))
     more = [n for n in found.quantities if n in found.determined and n not in names]
     return (names + more)[:MOST]
@@ -48,17 +57,22 @@ def chosen(found: Any) -> list[str]:
 
 @styled
 def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws the posterior `found` of what the data determine: densities, and 50, 80 and 95 % regions of pairs.
+    """Draws the posterior `found` of what the data determine: densities, and 50, 80 and 95 %
+    regions of pairs.
 
-    Of four quantities at most, so that it is legible in a column of 85 mm. `found.summary()` has all.
+    Of four quantities at most, so that it is legible in a column of 85 mm. `found.summary()` has
+    all.
 
-    **Raises:** `NotMixedError` if the chains did not mix; `ValueError` if the data determine nothing.
+    **Raises:** `NotMixedError` if the chains did not mix; `ValueError` if the data determine
+    nothing.
     """
     if not found.success:
         raise NotMixedError(f"{found.title}: {found.message}")
     names = chosen(found)[:PAIRS]
     if not names:
-        raise ValueError(f"{found.title}: the data determine no quantity, so there is nothing to draw")
+        raise ValueError(
+            f"{found.title}: the data determine no quantity, so there is nothing to draw"
+        )
     count = len(names)
     draws = [found.quantities[name].ravel() for name in names]
     limits = [np.quantile(x, CUT) for x in draws]
@@ -92,7 +106,10 @@ def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
 
 def _explained() -> list[Any]:
     """What lines and areas are, in the empty corner."""
-    regions = [Patch(color=color, label=f"region of {100 * mass:g} %") for mass, color in zip(MASS, REGIONS, strict=True)]
+    regions = [
+        Patch(color=color, label=f"region of {100 * mass:g} %")
+        for mass, color in zip(MASS, REGIONS, strict=True)
+    ]
     interval = Patch(color=BLUE, alpha=0.08, label="95 % interval")
     return [
         Patch(color=SKY, alpha=0.6, label="density"),
@@ -107,7 +124,16 @@ def _label(found: Any, name: str) -> str:
 
 
 def _density(ax: Axes, x: np.ndarray) -> None:
-    ax.hist(x, bins=60, range=ax.get_xlim(), density=True, histtype="stepfilled", color=SKY, alpha=0.6, lw=0)
+    ax.hist(
+        x,
+        bins=60,
+        range=ax.get_xlim(),
+        density=True,
+        histtype="stepfilled",
+        color=SKY,
+        alpha=0.6,
+        lw=0,
+    )
     low, middle, high = np.quantile(x, (0.025, 0.5, 0.975))
     ax.axvline(float(middle), color=BLUE, lw=1.0)
     ax.axvspan(float(low), float(high), color=BLUE, alpha=0.08, lw=0)
@@ -124,14 +150,17 @@ def _pair(ax: Axes, x: np.ndarray, y: np.ndarray, wide: np.ndarray, high: np.nda
     inside = np.cumsum(order) / order.sum()
     levels = np.unique([order[np.searchsorted(inside, mass)] for mass in MASS])
     mid = 0.5 * (xs[1:] + xs[:-1]), 0.5 * (ys[1:] + ys[:-1])
-    ax.contourf(*mid, smooth.T, levels=[*levels, smooth.max() * 1.01], colors=list(REGIONS[-len(levels) :]))
+    ax.contourf(
+        *mid, smooth.T, levels=[*levels, smooth.max() * 1.01], colors=list(REGIONS[-len(levels) :])
+    )
     ax.set_ylim(*high)
     ax.locator_params(nbins=2)
 
 
 @styled
 def predictive(found: Any, ax: Axes | None = None, target: str | None = None) -> Axes:
-    """Draws the target among spectra that the posterior `found` predicts; of several, the named one.
+    """Draws the target among spectra that the posterior `found` predicts; of several, the named
+    one.
 
     **Raises:** `NotMixedError`.
     """
@@ -144,9 +173,24 @@ def predictive(found: Any, ax: Axes | None = None, target: str | None = None) ->
     expected = part.replicates.expected.reshape(-1, len(f))
     for low, high, alpha in BANDS:
         label = f"predicted, {100 * (high - low):.0f} %"
-        ax.fill_between(f, *np.quantile(power, (low, high), axis=0), color=SKY, alpha=alpha + 0.1, lw=0, label=label)
+        ax.fill_between(
+            f,
+            *np.quantile(power, (low, high), axis=0),
+            color=SKY,
+            alpha=alpha + 0.1,
+            lw=0,
+            label=label,
+        )
     ax.plot(f, np.median(expected, axis=0), color=BLUE, lw=1.2, label="model, median")
-    ax.plot(f, np.asarray(part.target.proportional_power), color=VERMILLION, marker="o", ms=3, lw=0, label="target")
+    ax.plot(
+        f,
+        np.asarray(part.target.proportional_power),
+        color=VERMILLION,
+        marker="o",
+        ms=3,
+        lw=0,
+        label="target",
+    )
     log_axis(ax, "y")
     ax.set(xlabel="Frequency (Hz)", ylabel=PROPORTIONAL, xlim=(0, f[-1] + f[0]))
     ax.set_title(f"{part.target.name}, p = {part.replicates.p_value:.2g}", parse_math=False)
@@ -156,7 +200,8 @@ def predictive(found: Any, ax: Axes | None = None, target: str | None = None) ->
 
 @styled
 def chains(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws every chain of the posterior `found` over its draws, also of chains that did not mix."""
+    """Draws every chain of the posterior `found` over its draws, also of chains that did not
+    mix."""
     names = chosen(found) or list(found.samples)[:MOST]
     fig = canvas(ax, (COLUMN, 0.9 * len(names)))
     axes = fig.subplots(len(names), 1, sharex=True, squeeze=False)
@@ -164,12 +209,18 @@ def chains(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
         for number, chain in enumerate(found.quantities[name]):
             panel.plot(chain, lw=0.3, color=PALETTE[number % len(PALETTE)])
         r_hat, bulk, _ = found.diagnostics[name]
-        panel.set_title(in_words(name, found.unit(name)), pad=3.0, weight="normal", parse_math=False)
+        panel.set_title(
+            in_words(name, found.unit(name)), pad=3.0, weight="normal", parse_math=False
+        )
         panel.set_title(f"R-hat {r_hat:.3f}, ESS {bulk:.0f}", pad=3.0, weight="normal", loc="right")
-        panel.set_ylabel("ratio" if found.unit(name) in ("", "1") else unit_in_print(found.unit(name)))
+        panel.set_ylabel(
+            "ratio" if found.unit(name) in ("", "1") else unit_in_print(found.unit(name))
+        )
         for draw in np.unique(np.nonzero(found.chains.diverging)[1]):
             panel.axvline(draw, color=ORANGE, lw=0.5, zorder=0)
     axes[-1, 0].set_xlabel("Draw")
     fig.align_ylabels()
-    fitted_to(fig, 0.9 * len(names), heading(fig, found.title, bad="" if found.success else "Not mixed"))
+    fitted_to(
+        fig, 0.9 * len(names), heading(fig, found.title, bad="" if found.success else "Not mixed")
+    )
     return fig

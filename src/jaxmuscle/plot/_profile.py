@@ -29,13 +29,26 @@ HEIGHT, ACROSS = 1.7, 2  # inches, panels
 
 @styled
 def profile(found: Any, ax: Axes | None = None) -> Axes:
-    """Draws a profile likelihood with its interval and the parabola of the curvature. Returns the axes (`ax` or new)."""
+    """Draws a profile likelihood with its interval and the parabola of the curvature. Returns the
+    axes (`ax` or new)."""
     ax = axes_or_new(ax)
     ax.plot(found.values, found.rise, color=BLUE, marker="o", ms=2.5, lw=1.2, label="profile")
-    ax.axhline(found.threshold, color=GREY, lw=0.8, ls=(0, (4, 2)), label=f"{100 * found.level:g} % threshold")
+    ax.axhline(
+        found.threshold,
+        color=GREY,
+        lw=0.8,
+        ls=(0, (4, 2)),
+        label=f"{100 * found.level:g} % threshold",
+    )
     for number, (low, high) in enumerate(found.intervals):
         ends = found.values[0] if low is None else low, found.values[-1] if high is None else high
-        ax.axvspan(*ends, color=BLUE, alpha=0.1, lw=0, label=f"{100 * found.level:g} % interval" if not number else None)
+        ax.axvspan(
+            *ends,
+            color=BLUE,
+            alpha=0.1,
+            lw=0,
+            label=f"{100 * found.level:g} % interval" if not number else None,
+        )
     wide = np.all(found.values > 0) and found.values[-1] > 10 * found.values[0]
     if wide:
         x = np.geomspace(found.values[0], found.values[-1], 200)
@@ -53,15 +66,26 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
     ax.set_xlabel(found.name + ("" if found.unit == "1" else f" ({unit_in_print(found.unit)})"))
     ax.set_title(f"{found.target}: profile likelihood", pad=32, parse_math=False)
     if found.low is None or found.high is None:
-        side = "on both sides" if found.low is found.high else "downwards" if found.low is None else "upwards"
-        ax.text(0.99, 0.97, f"open {side}", transform=ax.transAxes, color=GREY, ha="right", va="top")
-    ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
+        side = (
+            "on both sides"
+            if found.low is found.high
+            else "downwards"
+            if found.low is None
+            else "upwards"
+        )
+        ax.text(
+            0.99, 0.97, f"open {side}", transform=ax.transAxes, color=GREY, ha="right", va="top"
+        )
+    ax.legend(
+        frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0
+    )
     return ax
 
 
 @styled
 def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws several `profiles` of one fit beside each other, each as `profile` does, with one legend; `ax`, their place.
+    """Draws several `profiles` of one fit beside each other, each as `profile` does, with one
+    legend; `ax`, their place.
 
     Returns the figure. Raises `ValueError` where there is none.
     """

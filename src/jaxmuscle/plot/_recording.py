@@ -1,4 +1,5 @@
-"""The figure of a recording, for `Recording.plot`: is the window steady, and what is in its spectrum?"""
+"""The figure of a recording, for `Recording.plot`: is the window steady, and what is in its
+spectrum?"""
 
 from typing import Any
 
@@ -28,7 +29,8 @@ MOST = 8  # traces of trials that are drawn
 
 @styled
 def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws a recording: the trace with its window, the window larger, and its spectra (Welch, FFT), linear, logarithmic.
+    """Draws a recording: the trace with its window, the window larger, and its spectra (Welch,
+    FFT), linear, logarithmic.
 
     `settings`: `SpectrumSettings` or a name, as of `Recording.spectrum`.
     """
@@ -49,10 +51,12 @@ def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
 
 @styled
 def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws several recordings below each other, each with its window, and their spectra with the mean.
+    """Draws several recordings below each other, each with its window, and their spectra with the
+    mean.
 
-    On the left each whole recording with the window shaded, on the right the window larger, low-passed. Below these the
-    spectra, linear and logarithmic. `settings`: `SpectrumSettings` or a name, as of `Recording.spectrum`.
+    On the left each whole recording with the window shaded, on the right the window larger,
+    low-passed. Below these the spectra, linear and logarithmic. `settings`: `SpectrumSettings` or a
+    name, as of `Recording.spectrum`.
     """
     if len(trials) == 1:
         return recording(trials[0], settings, ax)
@@ -66,7 +70,13 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure 
         whole = fig.add_subplot(grid[row, 0], sharex=whole, sharey=whole)
         whole.plot(one.start + np.arange(one.whole.size) / one.rate, one.whole, color=BLUE, lw=0.5)
         if one.window is not None:
-            whole.axvspan(*one.window, color=ORANGE, alpha=0.25, lw=0, label=None if row else "window: what is analysed")
+            whole.axvspan(
+                *one.window,
+                color=ORANGE,
+                alpha=0.25,
+                lw=0,
+                label=None if row else "window: what is analysed",
+            )
         whole.set_title(one.name, pad=2.0, weight="normal", parse_math=False)
         _label(whole, "Time (s)" if last else "", f"({one.unit})")
         x = one.filtered(settings)
@@ -82,8 +92,16 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure 
     for column, log in enumerate((False, True)):
         panel = fig.add_subplot(grid[-1, column])
         for one in each:
-            panel.plot(one.frequency, one.power, color=GREY, lw=0.6, label=f"{len(each)} trials" if one is each[0] else None)
-        panel.plot(mean.frequency, mean.power, color=ink(), lw=1.0, marker="o", ms=2.8, label="mean")
+            panel.plot(
+                one.frequency,
+                one.power,
+                color=GREY,
+                lw=0.6,
+                label=f"{len(each)} trials" if one is each[0] else None,
+            )
+        panel.plot(
+            mean.frequency, mean.power, color=ink(), lw=1.0, marker="o", ms=2.8, label="mean"
+        )
         _spectrum_axes(panel, mean.unit, log)
     words = f"{(trials[0].quantity or 'signal').capitalize()} of {len(trials)} trials"
     more = f", {len(shown)} shown" if len(shown) < len(trials) else ""
@@ -104,7 +122,13 @@ def _trace(ax: Axes, recording: Any) -> None:
 def _window(ax: Axes, recording: Any, settings: Any) -> None:
     x, time = recording.filtered(settings), recording.time
     ax.plot(time, recording.samples, color=SKY, lw=0.5, label="as recorded")
-    ax.plot(time[0] + np.arange(x.size) / (x.size / recording.duration), x, color=BLUE, lw=0.9, label="filtered")
+    ax.plot(
+        time[0] + np.arange(x.size) / (x.size / recording.duration),
+        x,
+        color=BLUE,
+        lw=0.9,
+        label="filtered",
+    )
     ax.axhline(float(np.mean(x)), color=GREY, lw=0.6, ls="--")
     ax.margins(x=0)
     _label(ax, "Time (s)", f"{(recording.quantity or 'signal').capitalize()} ({recording.unit})")
@@ -114,9 +138,20 @@ def _window(ax: Axes, recording: Any, settings: Any) -> None:
 def _spectra(ax: Axes, welch: Any, fft: Any, band: list[Any], label: str, log: bool) -> None:
     f, power = np.asarray(welch.frequency), np.asarray(welch.power)
     shown = slice(None) if not log else f > 0
-    ax.plot(fft.frequency, fft.power, color=GREY, lw=0.6, alpha=0.8, label="FFT of the window", zorder=2)
+    ax.plot(
+        fft.frequency, fft.power, color=GREY, lw=0.6, alpha=0.8, label="FFT of the window", zorder=2
+    )
     if band:
-        ax.fill_between(f[shown], band[0][shown], band[1][shown], color=BLUE, alpha=0.2, lw=0, label="± 1 SD", zorder=3)
+        ax.fill_between(
+            f[shown],
+            band[0][shown],
+            band[1][shown],
+            color=BLUE,
+            alpha=0.2,
+            lw=0,
+            label="± 1 SD",
+            zorder=3,
+        )
     ax.plot(f[shown], power[shown], color=ink(), lw=1.0, marker="o", ms=2.8, label=label, zorder=4)
     _spectrum_axes(ax, welch.unit, log)
 

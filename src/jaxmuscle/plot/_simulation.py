@@ -7,14 +7,30 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._spectra import _finite, _mean_and_band, spectrum
-from ._style import COLUMN, axes_or_new, canvas, fitted_to, heading, key, legend, output_label, styled, without_legend
+from ._style import (
+    COLUMN,
+    axes_or_new,
+    canvas,
+    fitted_to,
+    heading,
+    key,
+    legend,
+    output_label,
+    styled,
+    without_legend,
+)
 
 
 @styled
 def trajectory(
-    trajectory: Any, ax: Axes | None = None, *, window: tuple[float, float] | None = None, lines: int = 3
+    trajectory: Any,
+    ax: Axes | None = None,
+    *,
+    window: tuple[float, float] | None = None,
+    lines: int = 3,
 ) -> Axes:
-    """Draws the output over time; of an ensemble the mean, the band that holds 90 % of the seeds and a few of them.
+    """Draws the output over time; of an ensemble the mean, the band that holds 90 % of the seeds
+    and a few of them.
 
     **Arguments:**
 
@@ -45,7 +61,8 @@ def trajectory(
 
 @styled
 def simulation(runs: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws a simulation: the whole output over time, its analysed window, and the spectrum, linear and logarithmic.
+    """Draws a simulation: the whole output over time, its analysed window, and the spectrum, linear
+    and logarithmic.
 
     **Arguments:** `runs`, one seed or an ensemble; `ax`, its place. **Returns:** the figure.
     """

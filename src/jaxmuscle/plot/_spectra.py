@@ -6,7 +6,19 @@ import numpy as np
 from jaxtyping import Real
 from matplotlib.axes import Axes
 
-from ._style import BLUE, GREY, PALETTE, PROPORTIONAL, axes_or_new, density_unit, frequency_axis, ink, legend, shade, styled
+from ._style import (
+    BLUE,
+    GREY,
+    PALETTE,
+    PROPORTIONAL,
+    axes_or_new,
+    density_unit,
+    frequency_axis,
+    ink,
+    legend,
+    shade,
+    styled,
+)
 
 
 @styled
@@ -26,12 +38,21 @@ def estimate(estimate: Any, ax: Axes | None = None, *, log: bool = False) -> Axe
     ax = axes_or_new(ax)
     frequency, whole = np.asarray(estimate.frequency), float(np.sum(estimate.power))
     shown = slice(None) if not log else frequency > 0
-    rows = [(estimate.power, estimate.stderr, BLUE, "with control variate" if estimate.expected is not None else "mean")]
+    rows = [
+        (
+            estimate.power,
+            estimate.stderr,
+            BLUE,
+            "with control variate" if estimate.expected is not None else "mean",
+        )
+    ]
     if estimate.expected is not None:
         rows.append((estimate.plain_power, estimate.plain_stderr, GREY, "without"))
     for order, (power, stderr, color, name) in enumerate(rows):
         low, high = ((power + side * stderr)[shown] / whole for side in (-2, 2))
-        ax.fill_between(frequency[shown], low, high, color=color, alpha=0.25, lw=0, zorder=2 - order)
+        ax.fill_between(
+            frequency[shown], low, high, color=color, alpha=0.25, lw=0, zorder=2 - order
+        )
         label = f"{name} ({estimate.seeds} seeds, ± 2 SE)"
         ax.plot(frequency[shown], power[shown] / whole, color=color, label=label, zorder=3 - order)
     frequency_axis(ax, log)
@@ -46,12 +67,18 @@ _MODEL = "jaxmuscle-model"
 
 @styled
 def spectrum(
-    spectrum: Any, ax: Axes | None = None, *, log: bool = False, proportional: bool = True, label: str | None = None
+    spectrum: Any,
+    ax: Axes | None = None,
+    *,
+    log: bool = False,
+    proportional: bool = True,
+    label: str | None = None,
 ) -> Axes:
     """Draws power over frequency; of several seeds the mean and the band that holds 90 % of them.
 
-    The mean line is p_k = ⟨P_k⟩ / Σ_j ⟨P_j⟩, absolute power averaged before it is normalised; the band runs from the
-    5 % to the 95 % quantile of the seeds' own spectra. Seeds that are not finite are left out, and the legend says so.
+    The mean line is p_k = ⟨P_k⟩ / Σ_j ⟨P_j⟩, absolute power averaged before it is normalised; the
+    band runs from the 5 % to the 95 % quantile of the seeds' own spectra. Seeds that are not finite
+    are left out, and the legend says so.
 
     **Arguments:**
 
@@ -70,7 +97,9 @@ def spectrum(
     if proportional:
         mean, each = mean / mean.sum(), rows / rows.sum(-1, keepdims=True)
     shown = slice(None) if not log else frequency > 0
-    _mean_and_band(ax, frequency[shown], mean[shown], each[:, shown], ", ".join(filter(None, (label, kind))))
+    _mean_and_band(
+        ax, frequency[shown], mean[shown], each[:, shown], ", ".join(filter(None, (label, kind)))
+    )
     frequency_axis(ax, log)
     legend(ax, "lower left" if log else "upper right")
     ax.set_ylabel(PROPORTIONAL if proportional else f"Power ({density_unit(spectrum.unit)})")
@@ -81,10 +110,11 @@ def spectrum(
 def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     """Draws a target's proportional power with the band of its sampling error.
 
-    The band is where an expected spectrum lies at most one standard deviation from the target in log power:
-    p_k exp(-bias ± sd). With ν degrees of freedom bias = ψ(ν/2) - ln(ν/2) and sd² = ψ'(ν/2), otherwise bias = 0 and
-    sd² = ln(1 + (sigma_k/p_k)²). Without segments and sigma there is no band. The spectra of
-    single trials are thin lines, all divided by the same number (the sum of their mean): a trial with more power is higher.
+    The band is where an expected spectrum lies at most one standard deviation from the target in
+    log power: p_k exp(-bias ± sd). With ν degrees of freedom bias = ψ(ν/2) - ln(ν/2) and sd² =
+    ψ'(ν/2), otherwise bias = 0 and sd² = ln(1 + (sigma_k/p_k)²). Without segments and sigma there
+    is no band. The spectra of single trials are thin lines, all divided by the same number (the sum
+    of their mean): a trial with more power is higher.
 
     **Arguments:**
 
@@ -100,11 +130,20 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     if band is not None:
         low, high = band
         label = "± 1 SD (assumed)" if target.provenance == "reconstructed" else "± 1 SD of the data"
-        ax.fill_between(frequency[shown], low[shown], high[shown], color=shade(0.14), lw=0, label=label, zorder=1)
+        ax.fill_between(
+            frequency[shown],
+            low[shown],
+            high[shown],
+            color=shade(0.14),
+            lw=0,
+            label=label,
+            zorder=1,
+        )
     name = target.name if len(target.name) <= 40 else f"{target.name[:39]}…"
     style: dict[str, Any] = {"color": ink(), "lw": 0.6, "marker": "o", "ms": 2.8, "zorder": 3}
     (line,) = ax.plot(frequency[shown], power[shown], **style)
-    name = name.lstrip("_").replace("$", r"\$")  # neither hidden from the legend nor read as mathematics
+    # neither hidden from the legend nor read as mathematics
+    name = name.lstrip("_").replace("$", r"\$")
     line.set_label(f"{name} ({target.provenance})")
     if target.trial_power is not None:
         weights = np.asarray(target.segments)
@@ -117,12 +156,18 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     return ax
 
 
-def _finite(rows: Real[np.ndarray, "seeds values"]) -> tuple[Real[np.ndarray, "finite values"], str]:
+def _finite(
+    rows: Real[np.ndarray, "seeds values"],
+) -> tuple[Real[np.ndarray, "finite values"], str]:
     """The rows that are finite, and what the legend calls them; nothing for the only row of one."""
     finite = np.isfinite(rows).all(-1)
     label = f"mean of {finite.sum()} seeds" if len(rows) > 1 else ""
     if not finite.all():
-        label = f"{label}, {(~finite).sum()} not finite left out" if finite.any() and label else "not finite"
+        label = (
+            f"{label}, {(~finite).sum()} not finite left out"
+            if finite.any() and label
+            else "not finite"
+        )
     return (rows[finite] if finite.any() else np.full_like(rows[:1], np.nan)), label
 
 
@@ -133,10 +178,13 @@ def _mean_and_band(
     each: Real[np.ndarray, "seeds values"],
     label: str,
 ) -> str:
-    """A line in the next colour of the palette, with the seeds' band if there are several; returns the colour."""
+    """A line in the next colour of the palette, with the seeds' band if there are several; returns
+    the colour."""
     colour = PALETTE[sum(line.get_gid() == _MODEL for line in ax.lines) % len(PALETTE)]
     if len(each) > 1:
         low, high = np.quantile(each, QUANTILES, axis=0)
-        ax.fill_between(x, low, high, color=colour, alpha=0.2, lw=0, label="5 to 95 % of seeds", zorder=1)
+        ax.fill_between(
+            x, low, high, color=colour, alpha=0.2, lw=0, label="5 to 95 % of seeds", zorder=1
+        )
     ax.plot(x, mean, color=colour, label=label, gid=_MODEL, zorder=4)
     return colour

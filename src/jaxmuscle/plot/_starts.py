@@ -15,19 +15,26 @@ from ._style import BLUE, COLUMN, GREY, axes_or_new, ink, legend, log_axis, styl
 def starts(result: Any, ax: Axes | None = None) -> Axes:
     """Draws where the starts of a fit ended, the best first (a waterfall plot).
 
-    A level stretch is one solution that several starts found. The ordinate is the rise of chi² above the best start's,
-    linear below 1 and logarithmic above. A grey cross is a start that did not settle: its last step still lowered the cost
-    by a thousandth of it or more. Starts without a finite cost are left out.
+    A level stretch is one solution that several starts found. The ordinate is the rise of chi²
+    above the best start's, linear below 1 and logarithmic above. A grey cross is a start that did
+    not settle: its last step still lowered the cost by a thousandth of it or more. Starts without a
+    finite cost are left out.
 
-    **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`. **Returns:** the axes (`ax` or new).
+    **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`. **Returns:** the axes (`ax` or
+    new).
     """
     ax = axes_or_new(ax)
     ended = sorted((start.cost, start.success) for start in result.starts if start.cost is not None)
     cost, settled = np.array([c for c, _ in ended]), np.array([s for _, s in ended], bool)
     rank, rise = np.arange(1, len(cost) + 1), 2 * (cost - cost[:1])
-    for which, marker, color, label in ((settled, "o", BLUE, "settled"), (~settled, "x", GREY, "did not settle")):
+    for which, marker, color, label in (
+        (settled, "o", BLUE, "settled"),
+        (~settled, "x", GREY, "did not settle"),
+    ):
         if which.any():
-            ax.plot(rank[which], rise[which], marker, ms=3, color=color, label=f"{which.sum()} {label}")
+            ax.plot(
+                rank[which], rise[which], marker, ms=3, color=color, label=f"{which.sum()} {label}"
+            )
     ax.set(yscale="symlog", xlabel="Start, the best first", ylabel="Rise of χ²")
     ax.set_ylim(bottom=-0.1, auto=None)
     legend(ax, "above")
@@ -36,34 +43,52 @@ def starts(result: Any, ax: Axes | None = None) -> Axes:
 
 @styled
 def start_values(result: Any, ax: Axes | None = None) -> Axes:
-    """Draws which values the starts of a fit ended at: a line for each start, a row for each parameter.
+    """Draws which values the starts of a fit ended at: a line for each start, a row for each
+    parameter.
 
-    The abscissa is the value over that of the best start, which is black. The colour is the rise of chi² above the best
-    start's. A row in which dark lines lie wide apart is a parameter that the data leave open. Parameters that may be
-    negative are left out.
+    The abscissa is the value over that of the best start, which is black. The colour is the rise of
+    chi² above the best start's. A row in which dark lines lie wide apart is a parameter that the
+    data leave open. Parameters that may be negative are left out.
 
-    **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`, or a new figure. **Returns:** the axes.
+    **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`, or a new figure. **Returns:** the
+    axes.
 
-    **Raises:** `ValueError` where the end values are not known, as of fits saved by earlier versions.
+    **Raises:** `ValueError` where the end values are not known, as of fits saved by earlier
+    versions.
     """
     ended = sorted((s.cost, s.values) for s in result.starts if s.cost is not None and s.values)
     if not ended:
-        raise ValueError("the fit does not say where its starts ended: it was saved by an earlier version; fit again")
+        raise ValueError(
+            "the fit does not say where its starts ended: it was saved by an earlier version; fit"
+            " again"
+        )
     rise = 2 * (np.array([cost for cost, _ in ended]) - ended[0][0])
     values = np.array([row for _, row in ended])
     positive = np.atleast_1d((values > 0).all(axis=0))
     names = [name for name, shown in zip(result.settings["free"], positive, strict=True) if shown]
     ratio, rows = (values / values[0])[:, positive], np.arange(len(names))
     if ax is None:
-        ax = plt.figure(figsize=(COLUMN, 1.0 + 0.24 * len(names)), layout="constrained").add_subplot()
+        ax = plt.figure(
+            figsize=(COLUMN, 1.0 + 0.24 * len(names)), layout="constrained"
+        ).add_subplot()
     norm = SymLogNorm(1.0, vmin=0.0, vmax=max(float(rise.max()), 1.0))
     for i in range(len(ratio) - 1, -1, -1):
         color = ink() if i == 0 else plt.get_cmap("viridis")(norm(rise[i]))
-        ax.plot(ratio[i], rows, marker="o", ms=2.5, lw=1.2 if i == 0 else 0.6, color=color, zorder=2 + (i == 0))
+        ax.plot(
+            ratio[i],
+            rows,
+            marker="o",
+            ms=2.5,
+            lw=1.2 if i == 0 else 0.6,
+            color=color,
+            zorder=2 + (i == 0),
+        )
     ax.set_yticks(rows, names)
     ax.set_ylim(len(names) - 0.5, -0.5)
     log_axis(ax)
     ax.set_xlabel("Value over that of the best start")
-    bar = ax.figure.colorbar(ScalarMappable(norm, "viridis"), ax=ax, label="Rise of χ²", fraction=0.05, pad=0.02)
+    bar = ax.figure.colorbar(
+        ScalarMappable(norm, "viridis"), ax=ax, label="Rise of χ²", fraction=0.05, pad=0.02
+    )
     bar.outline.set_visible(False)
     return ax

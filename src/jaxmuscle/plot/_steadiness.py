@@ -1,4 +1,5 @@
-"""The figure of a steadiness report: power by band, coefficients of variation, regularity; every trial as a dot."""
+"""The figure of a steadiness report: power by band, coefficients of variation, regularity; every
+trial as a dot."""
 
 from typing import Any
 
@@ -11,7 +12,11 @@ from jaxmuscle._common.text import squared
 from ._style import BLUE, COLUMN, SKY, canvas, fitted_to, heading, key, log_axis, styled
 
 VARIATION = "coefficient_of_variation"
-VARIATIONS = {"all": VARIATION, "without\ndrift": f"{VARIATION}_without_drift", "above\n0.5 Hz": f"{VARIATION}_above_0.5"}
+VARIATIONS = {
+    "all": VARIATION,
+    "without\ndrift": f"{VARIATION}_without_drift",
+    "above\n0.5 Hz": f"{VARIATION}_above_0.5",
+}
 REGULARITY = {
     "approx.\nentropy": "approximate_entropy",
     "sample\nentropy": "sample_entropy",
@@ -23,14 +28,17 @@ HEIGHTS = 1.9, 1.8  # inches
 
 @styled
 def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws the steadiness of trials: power by band, coefficients of variation, entropies and DFA exponent.
+    """Draws the steadiness of trials: power by band, coefficients of variation, entropies and DFA
+    exponent.
 
-    Dots are trials. Beside them, large, stands the value of all trials with its 95 % interval. Letters are legible in a
-    column of 85 mm.
+    Dots are trials. Beside them, large, stands the value of all trials with its 95 % interval.
+    Letters are legible in a column of 85 mm.
     """
     fig = canvas(ax, (COLUMN, sum(HEIGHTS)))
     grid = fig.add_gridspec(2, 2, height_ratios=HEIGHTS)
-    power, variation, regularity = (fig.add_subplot(grid[place]) for place in ((0, slice(None)), (1, 0), (1, 1)))
+    power, variation, regularity = (
+        fig.add_subplot(grid[place]) for place in ((0, slice(None)), (1, 0), (1, 1))
+    )
     bands = {_range(name): name for name in steadiness.measures if name.startswith("power_")}
     _dots(power, steadiness, bands)
     log_axis(power, "y")
@@ -54,7 +62,8 @@ def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
 
 def _range(name: str) -> str:
     low, high = name.split("_")[1:]
-    return f"{high} to\n30" if low == "above" else f"{low} to\n{high}"  # the low-pass of what is measured
+    # the low-pass of what is measured
+    return f"{high} to\n30" if low == "above" else f"{low} to\n{high}"
 
 
 def _dots(ax: Axes, steadiness: Any, names: dict[str, str], scale: float = 1.0) -> None:
@@ -64,10 +73,20 @@ def _dots(ax: Axes, steadiness: Any, names: dict[str, str], scale: float = 1.0) 
     at = np.arange(len(names))
     if len(trials) > 1:
         label = "trials, in their order"
-        ax.plot((at[:, None] + beside).ravel(), each.ravel(), "o", ms=2.8, color=SKY, zorder=3, label=label)
+        ax.plot(
+            (at[:, None] + beside).ravel(),
+            each.ravel(),
+            "o",
+            ms=2.8,
+            color=SKY,
+            zorder=3,
+            label=label,
+        )
     found = [steadiness.measures[name] for name in names.values()]
     value = scale * np.array([m.value for m in found])
-    ends = scale * np.array([(np.nan, np.nan) if m.interval is None else m.interval for m in found]).T
+    ends = (
+        scale * np.array([(np.nan, np.nan) if m.interval is None else m.interval for m in found]).T
+    )
     error = np.maximum([value - ends[0], ends[1] - value], 0.0)
     label, place = ("mean, 95 % interval", at + MEAN) if len(trials) > 1 else ("95 % interval", at)
     ax.errorbar(place, value, error, fmt="o", ms=4, capsize=2.5, lw=1.2, color=BLUE, label=label)

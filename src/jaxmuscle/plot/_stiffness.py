@@ -1,4 +1,5 @@
-"""Panels of a dynamic stiffness: gain and phase with their errors, a curve through them, and what the curve misses."""
+"""Panels of a dynamic stiffness: gain and phase with their errors, a curve through them, and what
+the curve misses."""
 
 from typing import Any
 
@@ -14,15 +15,22 @@ Curve = tuple[str, Complex[np.ndarray, " bins"]]
 POINTS: dict[str, Any] = {"fmt": "o", "ms": 2.8, "lw": 0.8, "zorder": 3}
 
 
-def gain(ax: Axes, response: Any, curve: Curve | None = None, title: str = "Dynamic stiffness") -> None:
-    """The gain with two standard errors either way, and the gain of a curve with its name, at the same frequencies.
+def gain(
+    ax: Axes, response: Any, curve: Curve | None = None, title: str = "Dynamic stiffness"
+) -> None:
+    """The gain with two standard errors either way, and the gain of a curve with its name, at the
+    same frequencies.
 
-    Points of which two standard errors are larger than the curve, where nothing moved the insertion, are left out.
+    Points of which two standard errors are larger than the curve, where nothing moved the
+    insertion, are left out.
     """
     f, known, shown = response.frequency, np.isfinite(response.stderr), _shown(response, curve)
-    low = np.minimum(2 * response.stderr, 0.95 * response.gain)  # a bar to 0 has no end on a logarithmic axis
+    # a bar to 0 has no end on a logarithmic axis
+    low = np.minimum(2 * response.stderr, 0.95 * response.gain)
     bars = np.where(known, [low, 2 * response.stderr], 0.0)
-    ax.errorbar(f[shown], response.gain[shown], bars[:, shown], label="± 2 SE", color=ink(), **POINTS)
+    ax.errorbar(
+        f[shown], response.gain[shown], bars[:, shown], label="± 2 SE", color=ink(), **POINTS
+    )
     if curve is not None:
         name, values = curve
         fine, smooth = _smooth(f, values)
@@ -43,12 +51,15 @@ def phase(ax: Axes, response: Any, curve: Curve | None = None) -> None:
         fine, smooth = _smooth(f, curve[1])
         turned = np.degrees(np.unwrap(np.angle(smooth)))
         ax.plot(fine, turned, color=BLUE, lw=1.2, label=curve[0], zorder=2)
-        values = values + 360 * np.rint((np.interp(f, fine, turned) - values) / 360)  # the turn nearest to the curve
+        # the turn nearest to the curve
+        values = values + 360 * np.rint((np.interp(f, fine, turned) - values) / 360)
     ax.errorbar(f[shown], values[shown], bars[shown], label="± 2 SE", color=ink(), **POINTS)
     ax.axhline(0, color=GREY, lw=0.6)
     ax.set_ylabel("Phase (deg)")
     low, high = ax.get_ylim()
-    ax.yaxis.set_major_locator(MultipleLocator(45 if high - low > 100 else 15 if high - low > 30 else 5))
+    ax.yaxis.set_major_locator(
+        MultipleLocator(45 if high - low > 100 else 15 if high - low > 30 else 5)
+    )
     log_axis(ax)
 
 
@@ -57,8 +68,10 @@ def stiffness_residuals(ax: Axes, part: Any) -> None:
     f, off = part.target.stiffness.known.frequency, part.stiffness_residual
     for deviations, grey in ((2, 0.06), (1, 0.13)):
         ax.axhspan(-deviations, deviations, color=shade(grey), lw=0, zorder=0)
-    for values, marker, colour, name in ((np.real(off), "o", BLUE, "real (spring, mass)"),
-                                         (np.imag(off), "^", ORANGE, "imaginary (damping)")):  # fmt: skip
+    for values, marker, colour, name in (
+        (np.real(off), "o", BLUE, "real (spring, mass)"),
+        (np.imag(off), "^", ORANGE, "imaginary (damping)"),
+    ):
         ax.plot(f, values, color=colour, lw=0.6, marker=marker, ms=3.5, label=name, zorder=3)
     reach = 1.1 * float(np.max(np.abs([np.real(off), np.imag(off)]), initial=3.0))
     ax.axhline(0, color=ink(), lw=0.6, zorder=2)
@@ -69,8 +82,13 @@ def stiffness_residuals(ax: Axes, part: Any) -> None:
 
 
 def _shown(response: Any, curve: Curve | None) -> np.ndarray:
-    """Which points say something: those with two standard errors smaller than the curve, where there is one."""
-    return np.full(len(response.frequency), True) if curve is None else ~(2 * response.stderr > np.abs(curve[1]))
+    """Which points say something: those with two standard errors smaller than the curve, where
+    there is one."""
+    return (
+        np.full(len(response.frequency), True)
+        if curve is None
+        else ~(2 * response.stderr > np.abs(curve[1]))
+    )
 
 
 def _smooth(f: np.ndarray, values: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -79,6 +97,7 @@ def _smooth(f: np.ndarray, values: Any) -> tuple[np.ndarray, np.ndarray]:
         return f, values
     fine = np.unique(np.concatenate([f, np.geomspace(f[0], f[-1], 200)]))
     real, imaginary = (
-        scipy.interpolate.PchipInterpolator(np.log(f), part(values))(np.log(fine)) for part in (np.real, np.imag)
+        scipy.interpolate.PchipInterpolator(np.log(f), part(values))(np.log(fine))
+        for part in (np.real, np.imag)
     )
     return fine, real + 1j * imaginary

@@ -1,4 +1,5 @@
-"""The figure of a study: spectra of people and means of their groups, a panel for each condition."""
+"""The figure of a study: spectra of people and means of their groups, a panel for each
+condition."""
 
 from typing import Any
 
@@ -7,7 +8,17 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._style import COLUMN, PALETTE, canvas, density_unit, fitted_to, frequency_axis, key, named, styled
+from ._style import (
+    COLUMN,
+    PALETTE,
+    canvas,
+    density_unit,
+    fitted_to,
+    frequency_axis,
+    key,
+    named,
+    styled,
+)
 
 HEIGHT, ACROSS = 2.2, 2  # inches, panels beside each other
 HALF, LONGEST, TITLE = 26, 40, 24  # letters: half a line of the key, a group's name, a condition's
@@ -15,26 +26,42 @@ HALF, LONGEST, TITLE = 26, 40, 24  # letters: half a line of the key, a group's 
 
 @styled
 def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> Figure | SubFigure:
-    """Draws the spectrum of every person (thin) and the geometric mean of each group with its standard error (thick).
+    """Draws the spectrum of every person (thin) and the geometric mean of each group with its
+    standard error (thick).
 
     **Arguments:**
 
     - `study`: a `StudyResult`
     - `ax`: its place, or a new figure
-    - `proportional`: or else power in unit²/Hz, which is known where everybody has at least two trials
+    - `proportional`: or else power in unit²/Hz, which is known where everybody has at least two
+      trials
 
-    **Raises:** `ValueError` for power in unit²/Hz where it is not known, or where people were measured in different units.
+    **Raises:** `ValueError` for power in unit²/Hz where it is not known, or where people were
+    measured in different units.
     """
     cells = study.cells
     units = {cell.target.unit for cell in cells}
-    if not proportional and (len(units) > 1 or any(cell.target.trial_power is None for cell in cells)):
-        raise ValueError("proportional = False: power is known where everybody has at least two trials, in the same unit")
+    if not proportional and (
+        len(units) > 1 or any(cell.target.trial_power is None for cell in cells)
+    ):
+        raise ValueError(
+            "proportional = False: power is known where everybody has at least two trials, in the"
+            " same unit"
+        )
     down, across = -(-len(study.conditions) // ACROSS), min(len(study.conditions), ACROSS)
     fig = canvas(ax, (COLUMN, HEIGHT * down))
     axes = fig.subplots(down, across, squeeze=False, sharex=True, sharey=True)
-    here = {(group, condition): [cell.target for cell in cells if (cell.group, cell.condition) == (group, condition)]
-            for group in study.groups for condition in study.conditions}  # fmt: skip
-    labels = [counted(group, *(len(here[group, condition]) for condition in study.conditions)) for group in study.groups]
+    here = {
+        (group, condition): [
+            cell.target for cell in cells if (cell.group, cell.condition) == (group, condition)
+        ]
+        for group in study.groups
+        for condition in study.conditions
+    }
+    labels = [
+        counted(group, *(len(here[group, condition]) for condition in study.conditions))
+        for group in study.groups
+    ]
     for place, (panel, condition) in enumerate(zip(axes.flat, study.conditions, strict=False)):
         for number, group in enumerate(study.groups):
             if here[group, condition]:
@@ -50,7 +77,9 @@ def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> F
         panel.remove()
     unit = next(iter(units)) or "?"
     for row in axes:
-        row[0].set_ylabel("Power (fraction per bin)" if proportional else f"Power ({density_unit(unit)})")
+        row[0].set_ylabel(
+            "Power (fraction per bin)" if proportional else f"Power ({density_unit(unit)})"
+        )
     fitted_to(fig, HEIGHT * down, key(fig, columns(labels), plain=True))
     return fig
 
@@ -58,7 +87,9 @@ def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> F
 def counted(group: str, *numbers: int) -> str:
     """A group and how many people it has, of conditions with different numbers the range."""
     low, high = min(filter(None, numbers), default=0), max(numbers)
-    people = "1 person" if high == 1 else f"{high} people" if low == high else f"{low} to {high} people"
+    people = (
+        "1 person" if high == 1 else f"{high} people" if low == high else f"{low} to {high} people"
+    )
     return f"{named(group, LONGEST)} ({people})" if group else people
 
 
@@ -67,8 +98,11 @@ def columns(labels: list[str]) -> int:
     return ACROSS if max(map(len, labels), default=0) <= HALF else 1
 
 
-def group_spectra(ax: Axes, targets: list[Any], colour: str, label: str, proportional: bool) -> None:
-    """Spectra of the people of a group (thin), their geometric mean and its standard error (thick)."""
+def group_spectra(
+    ax: Axes, targets: list[Any], colour: str, label: str, proportional: bool
+) -> None:
+    """Spectra of the people of a group (thin), their geometric mean and its standard error
+    (thick)."""
     rows = [target.proportional_power if proportional else _power(target) for target in targets]
     for target, row in zip(targets, rows, strict=True):
         ax.plot(target.frequency, row, color=colour, lw=0.5, alpha=0.45, zorder=2)

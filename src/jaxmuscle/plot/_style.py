@@ -1,4 +1,5 @@
-"""The style of all figures: colours that colour-blind readers can tell apart, sizes for print, axes with their units."""
+"""The style of all figures: colours that colour-blind readers can tell apart, sizes for print, axes
+with their units."""
 
 import functools
 import threading
@@ -45,7 +46,8 @@ STYLE: dict[str, Any] = {
 COLUMN = 4.4  # inches: in a column of 85 mm letters of 8 points are those of 6
 ON_DARK = 1.8  # times as strong is a grey on a dark page, to be seen as well
 LINE = 0.17  # inches
-NARROW = 4.0  # from end to end of a logarithmic axis: of so few 1, 2 and 5 may leave one number only
+# from end to end of a logarithmic axis: of so few 1, 2 and 5 may leave one number only
+NARROW = 4.0
 SIZE = (COLUMN, 3.0)
 LOCK = threading.RLock()  # pyplot and rcParams are those of all threads
 PROPORTIONAL = "Proportional power (fraction per bin)"
@@ -55,12 +57,14 @@ R = TypeVar("R")
 
 
 def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Runs a drawing function in this module's style, one thread at a time; the caller's rcParams stay the same."""
+    """Runs a drawing function in this module's style, one thread at a time; the caller's rcParams
+    stay the same."""
 
     @functools.wraps(draw)
     def inside(*args: P.args, **kwargs: P.kwargs) -> R:
         with LOCK:
-            # Not rc_context: it also restores what a notebook's backend sets about itself while the first figure is made.
+            # Not rc_context: it also restores what a notebook's backend sets about itself while the
+            # first figure is made.
             params = cast(Any, matplotlib.rcParams)
             before = {name: params[name] for name in STYLE}
             params.update(STYLE)
@@ -73,20 +77,25 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 def ink() -> str:
-    """The colour of letters, for lines and points that are to stand out: black, or white on a dark page."""
+    """The colour of letters, for lines and points that are to stand out: black, or white on a dark
+    page."""
     return matplotlib.rcParams["text.color"]
 
 
 def shade(strength: float) -> tuple[float, float, float]:
-    """A grey between the page (0) and the letters (1), for areas behind lines; right on a white and on a dark page."""
-    page, letters = (np.array(to_rgb(matplotlib.rcParams[name])) for name in ("axes.facecolor", "text.color"))
+    """A grey between the page (0) and the letters (1), for areas behind lines; right on a white and
+    on a dark page."""
+    page, letters = (
+        np.array(to_rgb(matplotlib.rcParams[name])) for name in ("axes.facecolor", "text.color")
+    )
     strength *= 1.0 if page.mean() > letters.mean() else ON_DARK
     red, green, blue = page + strength * (letters - page)
     return float(red), float(green), float(blue)
 
 
 def canvas(ax: Axes | None, size: tuple[float, float], **pads: float) -> Figure | SubFigure:
-    """What several panels are drawn into: a new figure of `size` [inches], or the place that `ax` has in its figure."""
+    """What several panels are drawn into: a new figure of `size` [inches], or the place that `ax`
+    has in its figure."""
     if ax is None:
         figure = plt.figure(figsize=size, layout="constrained")
         figure.set_layout_engine("constrained", **pads)
@@ -129,10 +138,21 @@ def key(fig: Figure | SubFigure, columns: int = 2, *, plain: bool = False) -> in
 
     `plain`, of names that somebody else gave, in which $ is no sign of mathematics.
     """
-    named = {label: handle for ax in fig.axes if ax.get_legend() is None
-             for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}  # fmt: skip
+    named = {
+        label: handle
+        for ax in fig.axes
+        if ax.get_legend() is None
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
     if named:
-        made = fig.legend(named.values(), named, loc="outside lower center", ncols=columns, frameon=False, columnspacing=1.2)
+        made = fig.legend(
+            named.values(),
+            named,
+            loc="outside lower center",
+            ncols=columns,
+            frameon=False,
+            columnspacing=1.2,
+        )
         for text in made.get_texts() if plain else ():
             text.set_parse_math(False)
     return -(-len(named) // columns)
@@ -157,12 +177,19 @@ def axes_or_new(ax: Axes | None) -> Axes:
 
 
 def legend(ax: Axes, place: Literal["upper right", "lower left", "above"]) -> None:
-    """A legend in a fixed place, if there is anything to name: the best place is slow to find among many lines."""
+    """A legend in a fixed place, if there is anything to name: the best place is slow to find among
+    many lines."""
     named = len(ax.get_legend_handles_labels()[0])
     if not named:
         return
     if place == "above":
-        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(named, 3), borderaxespad=0.0, columnspacing=1.2)
+        ax.legend(
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=min(named, 3),
+            borderaxespad=0.0,
+            columnspacing=1.2,
+        )
     else:
         ax.legend(loc=place)
 
@@ -179,12 +206,17 @@ def frequency_axis(ax: Axes, log: bool) -> None:
 
 
 def log_axis(ax: Axes, which: Literal["x", "y"] = "x") -> None:
-    """A logarithmic abscissa or ordinate with plain numbers, as many as have room, and two at least."""
+    """A logarithmic abscissa or ordinate with plain numbers, as many as have room, and two at
+    least."""
     ax.set(**{f"{which}scale": "log"})
-    (low, high), axis, decades = (ax.get_xlim(), ax.xaxis, 1e3) if which == "x" else (ax.get_ylim(), ax.yaxis, 1e2)
+    (low, high), axis, decades = (
+        (ax.get_xlim(), ax.xaxis, 1e3) if which == "x" else (ax.get_ylim(), ax.yaxis, 1e2)
+    )
     narrow = high < NARROW * low
     axis.set_major_locator(
-        MaxNLocator(4, min_n_ticks=2) if narrow else LogLocator(subs=(1.0, 2.0, 5.0) if high < decades * low else (1.0,))
+        MaxNLocator(4, min_n_ticks=2)
+        if narrow
+        else LogLocator(subs=(1.0, 2.0, 5.0) if high < decades * low else (1.0,))
     )
     if narrow:
         axis.set_minor_locator(NullLocator())

@@ -1,6 +1,8 @@
-"""What follows from the model without simulating it: equilibrium, linear response, expected spectra, sensitivity, levels.
+"""What follows from the model without simulating it: equilibrium, linear response, expected
+spectra, sensitivity, levels.
 
-Small fluctuations about the operating point. Also presets, since their tasks are scaled to a mean force.
+Small fluctuations about the operating point. Also presets, since their tasks are scaled to a mean
+force.
 """
 
 import lazy_loader

@@ -31,7 +31,8 @@ def _sylvester(A: Array, F: Array, Q: Array) -> Array:
 
 
 class Covariances(NamedTuple):
-    """A linear system without input whose outputs sum to the autocovariance, `r(s) = Σ row exp(matrix s) start`."""
+    """A linear system without input whose outputs sum to the autocovariance, `r(s) = Σ row
+    exp(matrix s) start`."""
 
     matrix: Float[Array, "all all"]
     rows: Float[Array, "channels all"]
@@ -39,13 +40,15 @@ class Covariances(NamedTuple):
 
 
 class _Chain:
-    """Linear systems one behind the other, `x' = M x + Γ w`, and the stationary covariance P of their states, built up."""
+    """Linear systems one behind the other, `x' = M x + Γ w`, and the stationary covariance P of
+    their states, built up."""
 
     def __init__(self, F: Array, G: Array):
         self.matrix, self.white, self.covariance = F, G, _sylvester(F, F, G @ G.T)
 
     def add(self, A: Array, inflow: Array, white: Array) -> int:
-        """Another system `y' = A y + inflow x + white w`; where its states begin. Its covariances follow one by one."""
+        """Another system `y' = A y + inflow x + white w`; where its states begin. Its covariances
+        follow one by one."""
         before, n = len(self.matrix), len(A)
         cross = _sylvester(A, self.matrix, inflow @ self.covariance + white @ self.white.T)
         fed = inflow @ cross.T
@@ -63,14 +66,18 @@ class _Chain:
 def covariances(task: AbstractTask, system: Linearisation) -> list[list[Covariances]]:
     """The stationary response to the noise: of each of its components a sum of independent parts.
 
-    The response `C (s - A)⁻¹ b + d + s e` to a scalar noise that acts on several inputs with b, d, e each: its states are
-    those of the transposed system, `p' = Aᵀ p + Cᵀ N`, of which every input reads `b p + d N + e N'`. So all inputs that
-    get a noise of the same colour have one small system, whatever their number.
+    The response `C (s - A)⁻¹ b + d + s e` to a scalar noise that acts on several inputs with b, d,
+    e each: its states are those of the transposed system, `p' = Aᵀ p + Cᵀ N`, of which every input
+    reads `b p + d N + e N'`. So all inputs that get a noise of the same colour have one small
+    system, whatever their number.
     """
     found, system = [], _balanced(system)
     for noise in task.noise.components:
         passes = [task.activation is not None and i in ACTIVE for i in noise.acts_on]
-        groups = [(active, [j for j, own in enumerate(passes) if own == active]) for active in (True, False)]
+        groups = [
+            (active, [j for j, own in enumerate(passes) if own == active])
+            for active in (True, False)
+        ]
         groups = [(active, group) for active, group in groups if group]
         apart = [groups] if noise.shared else [[group] for group in groups]
         found.append([_of_groups(task, system, noise, own) for own in apart])
@@ -78,8 +85,11 @@ def covariances(task: AbstractTask, system: Linearisation) -> list[list[Covarian
 
 
 def _balanced(system: Linearisation) -> Linearisation:
-    """The system in units of its states in which rows and columns of A are of one size: single precision needs it."""
-    A = jax.lax.stop_gradient(jnp.abs(system.A)) * (1 - jnp.eye(len(system.A), dtype=system.A.dtype))
+    """The system in units of its states in which rows and columns of A are of one size: single
+    precision needs it."""
+    A = jax.lax.stop_gradient(jnp.abs(system.A)) * (
+        1 - jnp.eye(len(system.A), dtype=system.A.dtype)
+    )
     scale = jnp.ones(len(A), A.dtype)
     for _ in range(2):
         for i in range(len(A)):
@@ -94,9 +104,13 @@ def _balanced(system: Linearisation) -> Linearisation:
 
 
 def _of_groups(
-    task: AbstractTask, system: Linearisation, noise: AbstractNoise, groups: list[tuple[bool, list[int]]]
+    task: AbstractTask,
+    system: Linearisation,
+    noise: AbstractNoise,
+    groups: list[tuple[bool, list[int]]],
 ) -> Covariances:
-    """The response to one component of the noise through some of its inputs, in groups: through the activation or not."""
+    """The response to one component of the noise through some of its inputs, in groups: through the
+    activation or not."""
     scale = task.noise_scale(noise)
     b, d, e = (x[..., np.array(noise.acts_on)] * scale for x in (system.B, system.D, system.E))
     made: ShapingFilter = jax.tree.map(lambda x: x.astype(b.dtype), noise.shaping_filter())
@@ -128,7 +142,8 @@ class Autocovariance(NamedTuple):
     next: Float[Array, "channels all"]
 
     def lagged(self, lags: int) -> Float[Array, " lags"]:
-        """r at lags 0, Δ, 2Δ ...: from few steps to the right and few long ones to the left, which meet in one product."""
+        """r at lags 0, Δ, 2Δ ...: from few steps to the right and few long ones to the left, which
+        meet in one product."""
         short, (channels, n) = (lags.bit_length() + 1) // 2, self.next.shape
         columns, rows = self.next.T[:, None], self.rows[None]
         for power in self.powers[:short]:
@@ -138,29 +153,44 @@ class Autocovariance(NamedTuple):
             if rows.shape[0] * columns.shape[1] >= lags - 1:
                 break
             rows = jnp.concatenate([rows, (rows.reshape(-1, n) @ power).reshape(rows.shape)])
-        later = rows.reshape(-1, channels * n) @ columns.transpose(2, 0, 1).reshape(channels * n, -1)
+        later = rows.reshape(-1, channels * n) @ columns.transpose(2, 0, 1).reshape(
+            channels * n, -1
+        )
         return jnp.concatenate([self.head, later.reshape(-1)])[:lags]
 
     def mean_variance(self, samples: Int[Array | np.ndarray, ""] | int) -> Float[Array, ""]:
-        """Variance of the mean of that many successive samples, `Σ_l 2 (n - l) / n² r(lΔ) + r(0) / n`, l = 1 ... n - 1.
+        """Variance of the mean of that many successive samples, `Σ_l 2 (n - l) / n² r(lΔ) + r(0) /
+        n`, l = 1 ... n - 1.
 
-        Sums of `Φ^m v` and of `m Φ^m v` double their length from power to power; a block counts if its bit of n - q is set.
+        Sums of `Φ^m v` and of `m Φ^m v` double their length from power to power; a block counts if
+        its bit of n - q is set.
         """
-        q, n, zero = len(self.head), jnp.asarray(samples, self.next.dtype), jnp.zeros_like(self.next)
+        q, n, zero = (
+            len(self.head),
+            jnp.asarray(samples, self.next.dtype),
+            jnp.zeros_like(self.next),
+        )
         count = jnp.maximum(jnp.asarray(samples) - q, 0)
 
         def double(sums: Array, block: tuple[Array, Array]) -> tuple[Array, None]:
             power, bit = block
             sum_all, rise_all, sum_here, rise_here = sums
             length = (2**bit).astype(n.dtype)
-            moved = jnp.stack([rise_all + length * sum_all, sum_all, rise_here + length * sum_here, sum_here])
+            moved = jnp.stack(
+                [rise_all + length * sum_all, sum_all, rise_here + length * sum_here, sum_here]
+            )
             moved = product(moved, power.T)
             counts = (count >> bit) % 2 == 1  # this block, then what is there already
             both = jnp.stack([sum_here + moved[1], rise_here + moved[0]])
-            return jnp.concatenate([jnp.where(counts, both, sums[:2]), sums[2:] + moved[:1:-1]]), None
+            return (
+                jnp.concatenate([jnp.where(counts, both, sums[:2]), sums[2:] + moved[:1:-1]]),
+                None,
+            )
 
         bits = jnp.arange(len(self.powers), dtype=count.dtype)
-        sums, _ = jax.lax.scan(double, jnp.stack([zero, zero, self.next, zero]), (self.powers, bits))
+        sums, _ = jax.lax.scan(
+            double, jnp.stack([zero, zero, self.next, zero]), (self.powers, bits)
+        )
         lag = jnp.arange(q, dtype=n.dtype)
         first = jnp.where(lag > 0, 2.0, 1.0) * jnp.maximum(n - lag, 0.0) @ self.head
         return (first + 2 * jnp.sum(self.rows * ((n - q) * sums[0] - sums[1]))) / n**2
@@ -168,7 +198,8 @@ class Autocovariance(NamedTuple):
 
 @functools.cache
 def _folded() -> tuple[Float[np.ndarray, "q points"], Float[np.ndarray, "blocks short"]]:
-    """The autocorrelation ρ of the low-pass: folded, for lags 0 ... q - 1, and as it is, in blocks of 2^SHORT.
+    """The autocorrelation ρ of the low-pass: folded, for lags 0 ... q - 1, and as it is, in blocks
+    of 2^SHORT.
 
     `r'(lΔ) = Σ_j ρ_j r(|l - j / FINER| Δ)`: from the lag q on, which ρ reaches, no lag is negative.
     """
@@ -182,24 +213,32 @@ def _folded() -> tuple[Float[np.ndarray, "q points"], Float[np.ndarray, "blocks 
 
 
 def _decimated(powers: Array, rows: Array, start: Array) -> tuple[Array, Array]:
-    """The first q values of what is low-passed against aliases, and its vector at the lag q; Φ carries to the next point.
+    """The first q values of what is low-passed against aliases, and its vector at the lag q; Φ
+    carries to the next point.
 
-    `Σ_j ρ_j Φ^j start` and `rows Φ^j start` with j = 2^SHORT a + b: few short steps, then few long ones.
+    `Σ_j ρ_j Φ^j start` and `rows Φ^j start` with j = 2^SHORT a + b: few short steps, then few long
+    ones.
     """
     fold, spread = (jnp.asarray(x, start.dtype) for x in _folded())
     short, long = powers[0].T, powers[SHORT]
     _, columns = jax.lax.scan(lambda x, _: (x @ short, x), start, length=2**SHORT)
     blocks = jnp.tensordot(spread[::-1], columns, 1)
     both = rows, jnp.zeros_like(start)
-    (_, carried), rows = jax.lax.scan(lambda x, block: ((x[0] @ long, x[1] @ long.T + block), x[0]), both, blocks)
+    (_, carried), rows = jax.lax.scan(
+        lambda x, block: ((x[0] @ long, x[1] @ long.T + block), x[0]), both, blocks
+    )
     return fold @ jnp.einsum("acn,bcn->ab", rows, columns).reshape(-1), carried
 
 
-def _autocovariance(system: Covariances, interval: float, lags: int, sampling: str) -> Autocovariance:
-    """Autocovariance of the sampled output, good for that many lags; not finite where it does not decay."""
+def _autocovariance(
+    system: Covariances, interval: float, lags: int, sampling: str
+) -> Autocovariance:
+    """Autocovariance of the sampled output, good for that many lags; not finite where it does not
+    decay."""
     (matrix, rows, start), finer = system, FINER if sampling == "filtered" else 1
     if sampling == "average":
-        # Means over the interval: r(0) = 2/Δ² c ∫(Δ-s) e^(Ms) ds v and r(lΔ) = c J Φ^(l-1) J v / Δ², J = ∫ e^(Ms) ds.
+        # Means over the interval: r(0) = 2/Δ² c ∫(Δ-s) e^(Ms) ds v and r(lΔ) = c J Φ^(l-1) J v /
+        # Δ², J = ∫ e^(Ms) ds.
         n = len(matrix)
         zero, eye = jnp.zeros_like(matrix), jnp.eye(n, dtype=matrix.dtype)
         blocks = jnp.block([[matrix * interval, eye, zero], [zero, zero, eye], [zero, zero, zero]])
@@ -214,17 +253,22 @@ def _autocovariance(system: Covariances, interval: float, lags: int, sampling: s
     if sampling == "filtered":
         first, following = _decimated(powers, rows, start)
         powers = powers[finer.bit_length() - 1 :]
-    # The last power carries an unstable system beyond any bound: no stationary covariance, so none is returned.
+    # The last power carries an unstable system beyond any bound: no stationary covariance, so none
+    # is returned.
     stable = jnp.max(jnp.abs(powers[-1])) < 1e3
-    return Autocovariance(jnp.where(stable, first, jnp.nan), rows, powers, jnp.where(stable, following, jnp.nan))
+    return Autocovariance(
+        jnp.where(stable, first, jnp.nan), rows, powers, jnp.where(stable, following, jnp.nan)
+    )
 
 
 def autocovariances(
     task: AbstractTask, system: Linearisation, settings: SpectrumSettings, lags: int
 ) -> tuple[Autocovariance, list[int]]:
-    """Of every independent part of the noise, along a leading axis; which component of the noise each belongs to.
+    """Of every independent part of the noise, along a leading axis; which component of the noise
+    each belongs to.
 
-    All are filled up to one size, so that whatever follows is traced and compiled once, however many there are.
+    All are filled up to one size, so that whatever follows is traced and compiled once, however
+    many there are.
     """
     parts = [(own, i) for i, each in enumerate(covariances(task, system)) for own in each]
     size = max(len(own.matrix) for own, _ in parts)
@@ -232,10 +276,13 @@ def autocovariances(
 
     def filled(own: Covariances) -> Covariances:
         more, less = size - len(own.matrix), count - len(own.rows)
-        decaying = -settings.rate * jnp.eye(more, dtype=own.matrix.dtype)  # states that nothing drives or reads
+        # states that nothing drives or reads
+        decaying = -settings.rate * jnp.eye(more, dtype=own.matrix.dtype)
         rows, start = (jnp.pad(x, ((0, less), (0, more))) for x in (own.rows, own.start))
         return Covariances(jax.scipy.linalg.block_diag(own.matrix, decaying), rows, start)
 
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *(filled(own) for own, _ in parts))
-    found = jax.vmap(lambda own: _autocovariance(own, 1 / settings.rate, lags, settings.sampling))(stacked)
+    found = jax.vmap(lambda own: _autocovariance(own, 1 / settings.rate, lags, settings.sampling))(
+        stacked
+    )
     return found, [i for _, i in parts]

@@ -1,4 +1,5 @@
-"""The static characteristics of a muscle: stiffness, damping and force, as its own methods give them."""
+"""The static characteristics of a muscle: stiffness, damping and force, as its own methods give
+them."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -28,14 +29,16 @@ Points = Float[np.ndarray, " points"]
 
 
 class StaticCharacteristics(eqx.Module):
-    """What a muscle's springs and dampers do, one by one and together; made by `static_characteristics`.
+    """What a muscle's springs and dampers do, one by one and together; made by
+    `static_characteristics`.
 
-    **Fields**, all (points,): `displacement` x [m] and `velocity` v [m/s] of one tissue; for tissue j = w, z at them the
-    coefficients `K_j` [N/m] and `C_j` [N s/m] of equation (2), their tangents `K_j_tangent` = dF_j/dx and `C_j_tangent` =
-    dD_j/dv (D_j: force of the damper), which small fluctuations see, and the spring force `F_j` [N]; `F_ext` [N], the
-    static force at the insertion held at x_z = `displacement`, at rest (P_w = 0) and `F_ext_active` at the task's P_w, not
-    a number where there is no equilibrium. Numbers: `P_w` [N], `x_w` and `x_z` [m] of the task's operating point. `units`
-    names the unit of every field.
+    **Fields**, all (points,): `displacement` x [m] and `velocity` v [m/s] of one tissue; for tissue
+    j = w, z at them the coefficients `K_j` [N/m] and `C_j` [N s/m] of equation (2), their tangents
+    `K_j_tangent` = dF_j/dx and `C_j_tangent` = dD_j/dv (D_j: force of the damper), which small
+    fluctuations see, and the spring force `F_j` [N]; `F_ext` [N], the static force at the insertion
+    held at x_z = `displacement`, at rest (P_w = 0) and `F_ext_active` at the task's P_w, not a
+    number where there is no equilibrium. Numbers: `P_w` [N], `x_w` and `x_z` [m] of the task's
+    operating point. `units` names the unit of every field.
     """
 
     displacement: Points
@@ -57,32 +60,52 @@ class StaticCharacteristics(eqx.Module):
     x_z: float
 
     units: ClassVar[dict[str, str]] = {
-        "displacement": "m", "velocity": "m/s", "K_w": "N/m", "K_z": "N/m", "K_w_tangent": "N/m", "K_z_tangent": "N/m",
-        "C_w": "N s/m", "C_z": "N s/m", "C_w_tangent": "N s/m", "C_z_tangent": "N s/m", "F_w": "N", "F_z": "N",
-        "F_ext": "N", "F_ext_active": "N", "P_w": "N", "x_w": "m", "x_z": "m",
-    }  # fmt: skip
+        "displacement": "m",
+        "velocity": "m/s",
+        "K_w": "N/m",
+        "K_z": "N/m",
+        "K_w_tangent": "N/m",
+        "K_z_tangent": "N/m",
+        "C_w": "N s/m",
+        "C_z": "N s/m",
+        "C_w_tangent": "N s/m",
+        "C_z_tangent": "N s/m",
+        "F_w": "N",
+        "F_z": "N",
+        "F_ext": "N",
+        "F_ext_active": "N",
+        "P_w": "N",
+        "x_w": "m",
+        "x_z": "m",
+    }
 
     def plot(self, ax: "Sequence[Axes] | None" = None) -> "tuple[Axes, Axes, Axes]":
-        """K(x), C(v) and force against displacement, in three axes (`ax`: three of yours). Returns the axes."""
+        """K(x), C(v) and force against displacement, in three axes (`ax`: three of yours). Returns
+        the axes."""
         return plot.static(self, ax)
 
 
 def static_characteristics(
     task: AbstractTask, *, span: float | None = None, speed: float = SPEED, points: int = 201
 ) -> StaticCharacteristics:
-    """K(x), C(v) and force against displacement of a task's muscle, from the methods of `AbstractMuscle` alone.
+    """K(x), C(v) and force against displacement of a task's muscle, from the methods of
+    `AbstractMuscle` alone.
 
         jm.static_characteristics(jm.Isometric()).plot()
 
-        F_w(x) = active_force(x, 0),      F_z(x) = passive_force(0, 0, x, 0),      K_j(x) = (F_j(x) - F_j(0)) / x
-        D_w(v) = active_force(0, v),      D_z(v) = passive_force(0, 0, 0, v),      C_j(v) = (D_j(v) - D_j(0)) / v
+        F_w(x) = active_force(x, 0),      F_z(x) = passive_force(0, 0, x, 0)
+        K_j(x) = (F_j(x) - F_j(0)) / x
+        D_w(v) = active_force(0, v),      D_z(v) = passive_force(0, 0, 0, v)
+        C_j(v) = (D_j(v) - D_j(0)) / v
 
-    the limit at 0, and the tangents by differentiation. F_ext(x) is the output of `Isometric` in equilibrium at x_z = x.
+    the limit at 0, and the tangents by differentiation. F_ext(x) is the output of `Isometric` in
+    equilibrium at x_z = x.
 
     **Arguments:**
 
     - `task`: whose muscle it is
-    - `span` [m]: displacements from -span to span (by default twice the largest of the operating point's, at least 0.02 m)
+    - `span` [m]: displacements from -span to span (by default twice the largest of the operating
+      point's, at least 0.02 m)
     - `speed` [m/s]: velocities from -speed to speed (by default 1 m/s)
     - `points`: odd to contain 0
 
@@ -94,9 +117,14 @@ def static_characteristics(
     with jax.enable_x64(True):
         task = as_arrays(task)
         P_w, x_w, x_z = _operating(task)
-        reach = max(SPAN, *(2 * abs(x) for x in (x_w, x_z) if np.isfinite(x))) if span is None else span
+        reach = (
+            max(SPAN, *(2 * abs(x) for x in (x_w, x_z) if np.isfinite(x))) if span is None else span
+        )
         x, v = jnp.linspace(-reach, reach, points), jnp.linspace(-speed, speed, points)
-        curves = {name: np.asarray(curve) for name, curve in _curves(task.muscle, x, v, jnp.asarray(P_w)).items()}
+        curves = {
+            name: np.asarray(curve)
+            for name, curve in _curves(task.muscle, x, v, jnp.asarray(P_w)).items()
+        }
     return StaticCharacteristics(np.asarray(x), np.asarray(v), **curves, P_w=P_w, x_w=x_w, x_z=x_z)
 
 
@@ -109,7 +137,10 @@ def _operating(task: AbstractTask) -> tuple[float, float, float]:
         x_z = y[task.state_names.index("x_z")] if "x_z" in task.state_names else jnp.nan
     else:
         x_z = prescribed(t) if isinstance(prescribed, AbstractSignal) else prescribed
-    P_w = task.output(t, y, jnp.zeros(5), jnp.zeros(5)) if isinstance(task, PrescribedMotion) else getattr(task, "P_w")(t)  # noqa: B009
+    if isinstance(task, PrescribedMotion):
+        P_w = task.output(t, y, jnp.zeros(5), jnp.zeros(5))
+    else:
+        P_w = getattr(task, "P_w")(t)  # noqa: B009 (no attribute of all tasks)
     return float(P_w), float(y[0]), float(x_z)
 
 
@@ -138,7 +169,11 @@ def _slopes(force: Callable[[Scalar], Scalar], q: Array) -> tuple[Array, Array, 
     values, tangents = jax.vmap(lambda at: jax.jvp(force, (at,), (jnp.ones_like(at),)))(q)
     # Within rounding of the origin the difference has no digits.
     near = jnp.abs(q) < 1e-9 * jnp.max(jnp.abs(q))
-    return values, jnp.where(near, tangents, (values - force(jnp.zeros(()))) / jnp.where(near, 1.0, q)), tangents
+    return (
+        values,
+        jnp.where(near, tangents, (values - force(jnp.zeros(()))) / jnp.where(near, 1.0, q)),
+        tangents,
+    )
 
 
 def _held_force(muscle: AbstractMuscle, x_z: Array, P_w: Array) -> Array:

@@ -18,11 +18,13 @@ GUESS = 1e-3
 
 
 def equilibrium(task: AbstractTask, time: Scalar | float = HOLD) -> Float[Array, " states"]:
-    """State y of `task` with `vector_field(time, y, 0) = 0` [m, m/s], by Newton's method; differentiable (implicitly).
+    """State y of `task` with `vector_field(time, y, 0) = 0` [m, m/s], by Newton's method;
+    differentiable (implicitly).
 
         state = jm.response.equilibrium(jm.Isometric())
 
-    Not finite where there is none. Functions that need one (`at_force`, `at_level`) end with an `OperatingPointError` there.
+    Not finite where there is none. Functions that need one (`at_force`, `at_level`) end with an
+    `OperatingPointError` there.
     """
     if all(is_concrete(leaf) for leaf in jax.tree.leaves((task, time))):
         return _kept_equilibrium(mechanics(task), np.asarray(time, jnp.result_type(float)))
@@ -49,29 +51,37 @@ def _equilibrium(task: AbstractTask, time: Scalar | float) -> Float[Array, " sta
         solution = optx.root_find(lambda y, _: function(y), method, y, max_steps=200, throw=False)
         return jnp.where(solution.result == optx.RESULTS.successful, solution.value, jnp.nan)
 
-    # optimistix's own implicit derivative checks its linear solve by a host callback, which JAX's compilation cache
-    # cannot keep: the same derivative without it.
-    # Off the origin, where the literal equation (2) has no stiffness and Newton's method no direction.
+    # optimistix's own implicit derivative checks its linear solve by a host callback, which JAX's
+    # compilation cache cannot keep: the same derivative without it. Off the origin, where the
+    # literal equation (2) has no stiffness and Newton's method no direction.
     start = task.initial_state() + GUESS
     held = getattr(task, "x_z", None)
     if task.initial is None and held is not None:
-        start = start.at[0].add(held(jnp.asarray(time, dtype)) if isinstance(held, AbstractSignal) else held)
-    # In units of the state, so that one tolerance suits accelerations and displacements in either precision.
+        start = start.at[0].add(
+            held(jnp.asarray(time, dtype)) if isinstance(held, AbstractSignal) else held
+        )
+    # In units of the state, so that one tolerance suits accelerations and displacements in either
+    # precision.
     slope = jnp.sum(jnp.abs(jax.lax.stop_gradient(jax.jacfwd(field)(start))), axis=1)
     scale = jnp.where((slope > 0) & jnp.isfinite(slope), slope, 1.0)
 
     def at_rest(y):
         return field(y) / scale
 
-    return jax.lax.custom_root(at_rest, start, newton, lambda g, y: jnp.linalg.solve(jax.jacfwd(g)(y), y))
+    return jax.lax.custom_root(
+        at_rest, start, newton, lambda g, y: jnp.linalg.solve(jax.jacfwd(g)(y), y)
+    )
 
 
 def mechanics(task: AbstractTask) -> AbstractTask:
-    """The task as arrays, with the usual spectrum settings: a program that needs none serves tasks of any settings."""
+    """The task as arrays, with the usual spectrum settings: a program that needs none serves tasks
+    of any settings."""
     return as_arrays(task.with_parts(settings=SpectrumSettings()))
 
 
-def jacobian(task: AbstractTask, y: Float[Array, " states"], time: Scalar | float = HOLD) -> Float[Array, "states states"]:
+def jacobian(
+    task: AbstractTask, y: Float[Array, " states"], time: Scalar | float = HOLD
+) -> Float[Array, "states states"]:
     """Jacobian [1/s] of the vector field with respect to the state at y."""
     task = as_arrays(task)
     return jax.jacfwd(lambda y: task.vector_field(jnp.asarray(time, y.dtype), y, jnp.zeros(5)))(y)
@@ -88,25 +98,35 @@ def slowest(system: Float[Array, "states states"]) -> Float[Array, ""]:
 
 
 def operating_point(task: AbstractTask, time: float = HOLD) -> tuple[np.ndarray, np.ndarray]:
-    """Equilibrium and its eigenvalues as numbers. Raises `OperatingPointError` if there is no equilibrium."""
+    """Equilibrium and its eigenvalues as numbers. Raises `OperatingPointError` if there is no
+    equilibrium."""
     with jax.enable_x64(True):
-        points, jacobians = _linearisations(mechanics(task), np.full(2, time))  # as many as for `fastest_rate`: one program
+        # as many as for `fastest_rate`: one program
+        points, jacobians = _linearisations(mechanics(task), np.full(2, time))
         if not np.all(np.isfinite(points[-1])):
             raise OperatingPointError(
-                f"{type(task).__name__} has no equilibrium at t = {time} s under its inputs "
-                f"(K_w0, K_z0, C_w0, C_z0 = {np.asarray(as_arrays(task).muscle.base())}): a stiffness must balance them"
+                f"{type(task).__name__} has no equilibrium at t = {time} s under its inputs (K_w0,"
+                f" K_z0, C_w0, C_z0 = {np.asarray(as_arrays(task).muscle.base())}): a stiffness"
+                " must balance them"
             )
         return np.asarray(points[-1]), np.linalg.eigvals(np.asarray(jacobians[-1]))
 
 
 def fastest_rate(task: AbstractTask, duration: float) -> float:
-    """Largest |eigenvalue| [1/s] at the start and under the inputs at mid-run and end, for the stability of a step."""
+    """Largest |eigenvalue| [1/s] at the start and under the inputs at mid-run and end, for the
+    stability of a step."""
     with jax.enable_x64(True):
         _, jacobians = _linearisations(mechanics(task), np.array([duration / 2, duration]))
-        rates = [np.abs(np.linalg.eigvals(j)).max() for j in np.asarray(jacobians) if np.all(np.isfinite(j))]
+        rates = [
+            np.abs(np.linalg.eigvals(j)).max()
+            for j in np.asarray(jacobians)
+            if np.all(np.isfinite(j))
+        ]
     if not rates:
-        raise OperatingPointError(f"the equations of this {type(task).__name__} are not finite where it starts: one of its "
-                                  "numbers is NaN or infinite, or a mass or a damping that it divides by is 0")  # fmt: skip
+        raise OperatingPointError(
+            f"the equations of this {type(task).__name__} are not finite where it starts: one of"
+            " its numbers is NaN or infinite, or a mass or a damping that it divides by is 0"
+        )
     return float(max(rates))
 
 
@@ -114,6 +134,11 @@ def fastest_rate(task: AbstractTask, duration: float) -> float:
 def _linearisations(
     task: AbstractTask, times: Float[np.ndarray | Array, " times"]
 ) -> tuple[Float[Array, "points states"], Float[Array, "points states states"]]:
-    """Initial state and equilibria at the given times, with the Jacobians there; that of the start at the last time."""
-    points = jnp.concatenate([task.initial_state()[None], jax.vmap(lambda t: equilibrium(task, t))(times)])
-    return points, jax.vmap(lambda y, t: jacobian(task, y, t))(points, jnp.concatenate([times[-1:], times]))
+    """Initial state and equilibria at the given times, with the Jacobians there; that of the start
+    at the last time."""
+    points = jnp.concatenate(
+        [task.initial_state()[None], jax.vmap(lambda t: equilibrium(task, t))(times)]
+    )
+    return points, jax.vmap(lambda y, t: jacobian(task, y, t))(
+        points, jnp.concatenate([times[-1:], times])
+    )

@@ -25,16 +25,19 @@ from ._linearised import Linearisation, LinearTask, linearisation, linearise
 
 TAIL = 1e-13
 ROUNDING = 1e-20  # of any unit of the output: fluctuations that are smaller are none
-LAGS = 4096  # a program is made for so many samples, for 4 times, 16 times ... as many, and serves all below
+# a program is made for so many samples, for 4 times, 16 times ... as many, and serves all below
+LAGS = 4096
 
 
 class Moments(NamedTuple):
-    """What a fit compares: Welch power per bin, that of the harmonic alone, mean and variance of a recording.
+    """What a fit compares: Welch power per bin, that of the harmonic alone, mean and variance of a
+    recording.
 
-    The variance is that of the low-passed output, as a recording's: what lies above the low-pass is not in it. `rate` is
-    the slowest of the operating point [1/s], `half` the frequency of half power of the slow part [Hz], where they were
-    computed. `resonant`: Welch power per bin of every resonance alone. `stiffness`: real and imaginary part of the dynamic
-    stiffness at the points of a measured one.
+    The variance is that of the low-passed output, as a recording's: what lies above the low-pass is
+    not in it. `rate` is the slowest of the operating point [1/s], `half` the frequency of half
+    power of the slow part [Hz], where they were computed. `resonant`: Welch power per bin of every
+    resonance alone. `stiffness`: real and imaginary part of the dynamic stiffness at the points of
+    a measured one.
     """
 
     power: Float[Array | np.ndarray, " bins"]
@@ -60,7 +63,8 @@ class Moments(NamedTuple):
 
 @functools.cache
 def low_pass_spread(settings: SpectrumSettings) -> Float[np.ndarray, " lags"]:
-    """ρ, the autocorrelation of the low-pass's impulse response at lags -m ... m: it turns r into `r * ρ`."""
+    """ρ, the autocorrelation of the low-pass's impulse response at lags -m ... m: it turns r into
+    `r * ρ`."""
     if settings.sections is None:
         return np.ones(1)
     impulse = scipy.signal.sosfilt(settings.sections, np.eye(1, 64 * settings.length)[0])
@@ -74,15 +78,19 @@ def low_pass_spread(settings: SpectrumSettings) -> Float[np.ndarray, " lags"]:
 
 @functools.cache
 def covariance_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins_and_two lags"]:
-    """M with expected Welch power `E_k = Σ_l M_kl r(l Δ)`: low-pass, detrending, taper and transform.
+    """M with expected Welch power `E_k = Σ_l M_kl r(l Δ)`: low-pass, detrending, taper and
+    transform.
 
-    The low-pass turns r into `r * ρ` (`low_pass_spread`); a bin is `Σ_l α_k(l) r(l)`, α_k the sum of the autocorrelations of
-    its `bin_rows`. Both are folded onto lags l >= 0. Two more rows: the variance of what has passed, (r * ρ)(0); and
-    `Σ_l ((|·| * ρ)(l) - |l|) r(l)`, by which the low-pass lowers n² times the variance of the mean of n samples
-    (`Σ_l (n - |l|) / n² r(l)` without it; where r has decayed at the n-th lag).
+    The low-pass turns r into `r * ρ` (`low_pass_spread`); a bin is `Σ_l α_k(l) r(l)`, α_k the sum
+    of the autocorrelations of its `bin_rows`. Both are folded onto lags l >= 0. Two more rows: the
+    variance of what has passed, (r * ρ)(0); and `Σ_l ((|·| * ρ)(l) - |l|) r(l)`, by which the
+    low-pass lowers n² times the variance of the mean of n samples (`Σ_l (n - |l|) / n² r(l)`
+    without it; where r has decayed at the n-th lag).
     """
     rows, spread = bin_rows(settings), low_pass_spread(settings)
-    lagged = np.array([sum(scipy.signal.correlate(row, row, method="fft").real for row in each) for each in rows])
+    lagged = np.array(
+        [sum(scipy.signal.correlate(row, row, method="fft").real for row in each) for each in rows]
+    )
     lagged = np.concatenate([lagged, np.eye(1, lagged.shape[1], lagged.shape[1] // 2)])
     full = np.array([scipy.signal.convolve(row, spread, method="fft") for row in lagged])
     centre, reach = full.shape[1] // 2, len(spread) // 2
@@ -97,13 +105,18 @@ def lags_of(settings: SpectrumSettings) -> int:
     return settings.length + len(low_pass_spread(settings)) // 2
 
 
-def expected_powers(settings: SpectrumSettings, r: Float[Array | np.ndarray, " lags"]) -> Float[Array, " bins_and_two"]:
-    """`covariance_operator(settings) @ r`; of long segments by Fourier transforms, without that matrix.
+def expected_powers(
+    settings: SpectrumSettings, r: Float[Array | np.ndarray, " lags"]
+) -> Float[Array, " bins_and_two"]:
+    """`covariance_operator(settings) @ r`; of long segments by Fourier transforms, without that
+    matrix.
 
-    With R = r * ρ, T the matrix of its values R(|m - n|), w a taper, c its autocorrelation, q the orthonormal directions
-    that detrending removes and F the transform at the bins (docs/model.md, *Long segments*):
+    With R = r * ρ, T the matrix of its values R(|m - n|), w a taper, c its autocorrelation, q the
+    orthonormal directions that detrending removes and F the transform at the bins (docs/model.md,
+    *Long segments*):
 
-        E_k ∝ Σ_w [F(c R) of both signs of l - 2 Re Σ_q F(w T q)* F(w q) + Σ_pq F(w p)* F(w q) pᵀ T q]_k
+        E_k ∝ Σ_w [F(c R) of both signs of l - 2 Re Σ_q F(w T q)* F(w q)
+                   + Σ_pq F(w p)* F(w q) pᵀ T q]_k
     """
     r = jnp.asarray(r)
     if settings.length <= LONG:
@@ -111,14 +124,21 @@ def expected_powers(settings: SpectrumSettings, r: Float[Array | np.ndarray, " l
     n, spread = settings.length, low_pass_spread(settings)
     reach, tapers, away = len(spread) // 2, tapers_of(settings, n), removed(settings)
     convolved = jax.scipy.signal.fftconvolve
-    R = convolved(jnp.concatenate([r[reach:0:-1], r[: n + reach]]), jnp.asarray(spread, r.dtype), mode="valid")
+    R = convolved(
+        jnp.concatenate([r[reach:0:-1], r[: n + reach]]), jnp.asarray(spread, r.dtype), mode="valid"
+    )
     own = np.sum([scipy.signal.correlate(w, w, method="fft")[n - 1 :] for w in tapers], axis=0)
     power = 2 * jnp.real(transformed(settings, jnp.asarray(own, r.dtype) * R)) - own[0] * R[0]
-    moved = [convolved(jnp.concatenate([R[:0:-1], R]), jnp.asarray(q, r.dtype), mode="valid") for q in away]
+    moved = [
+        convolved(jnp.concatenate([R[:0:-1], R]), jnp.asarray(q, r.dtype), mode="valid")
+        for q in away
+    ]
     for w in tapers:
         seen = [transformed(settings, jnp.asarray(w * q, r.dtype)) for q in away]
         for here, Tq in zip(seen, moved, strict=True):
-            power -= 2 * jnp.real(jnp.conj(transformed(settings, jnp.asarray(w, r.dtype) * Tq)) * here)
+            power -= 2 * jnp.real(
+                jnp.conj(transformed(settings, jnp.asarray(w, r.dtype) * Tq)) * here
+            )
             for there, p in zip(seen, away, strict=True):
                 power += jnp.real(jnp.conj(there) * here) * (jnp.asarray(p, r.dtype) @ Tq)
     lowered = _lowered(spread)[reach:] * np.append(1.0, np.full(reach, 2.0))
@@ -134,9 +154,13 @@ def _lowered(spread: Float[np.ndarray, " lags"]) -> Float[np.ndarray, " lags"]:
 
 
 def noise_response(
-    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, samples: Int[Array | np.ndarray, ""] | int
+    task: AbstractTask,
+    system: Linearisation,
+    settings: SpectrumSettings,
+    samples: Int[Array | np.ndarray, ""] | int,
 ) -> tuple[Float[Array, "components bins"], Float[Array, ""]]:
-    """Expected Welch power of each component of the noise, and variance of so many low-passed samples about their mean."""
+    """Expected Welch power of each component of the noise, and variance of so many low-passed
+    samples about their mean."""
     lags = lags_of(settings)
     each, of = autocovariances(task, system, settings, max(lags, LONGEST))
     belongs = np.equal.outer(np.arange(len(task.noise.components)), of).astype(system.A.dtype)
@@ -148,7 +172,8 @@ def noise_response(
 
 
 def noise_variance(task: AbstractTask, system: Linearisation) -> Float[Array, ""]:
-    """Stationary variance of the output without the harmonic, at an instant, before any low-pass."""
+    """Stationary variance of the output without the harmonic, at an instant, before any
+    low-pass."""
     each = [own for component in covariances(task, system) for own in component]
     return sum((jnp.sum(own.rows * own.start) for own in each), jnp.zeros((), system.A.dtype))
 
@@ -159,16 +184,22 @@ def response(
     window: tuple[float, float],
     samples: Int[Array | np.ndarray, ""] | int | None = None,
 ) -> tuple[Moments, Linearisation]:
-    """Expected moments of the linearised task in the window, and the linearisation. Not finite where it is unstable.
+    """Expected moments of the linearised task in the window, and the linearisation. Not finite
+    where it is unstable.
 
-    The variance is that of so many samples from the window's begin on, by default as many as it has.
+    The variance is that of so many samples from the window's begin on, by default as many as it
+    has.
     """
     samples = samples_in(window, settings) if samples is None else samples
     system = linearise(task)
     noise, variance = noise_response(task, system, settings, samples)
     line, swing = harmonic_line(task, system, settings, window, samples)
     unknown = jnp.full((), jnp.nan, line.dtype)  # the slowest rate has no second derivative
-    resonant = tuple(own for own, part in zip(noise, task.noise.components, strict=True) if isinstance(part, ResonantNoise))
+    resonant = tuple(
+        own
+        for own, part in zip(noise, task.noise.components, strict=True)
+        if isinstance(part, ResonantNoise)
+    )
     power = jnp.sum(noise, axis=0) + line
     return Moments(power, line, system.rest, variance + swing, unknown, unknown, resonant), system
 
@@ -184,8 +215,8 @@ def expected_moments(
 ) -> tuple[Moments, Linearisation]:
     """`response`, compiled once for all numbers of samples.
 
-    Outside a transformation by two programs: that of the linearisation serves all settings, and what follows from it all
-    tasks with as many states.
+    Outside a transformation by two programs: that of the linearisation serves all settings, and
+    what follows from it all tasks with as many states.
     """
     samples = as_arrays(samples_in(window, settings) if samples is None else samples, int)
     if all_concrete((task, samples)):
@@ -194,14 +225,20 @@ def expected_moments(
     return _compiled_response(as_arrays(task), settings, window, samples)
 
 
-def log_variation_sd(task: AbstractTask, settings: SpectrumSettings, samples: int) -> Float[Array, ""]:
-    """Standard deviation of the log of the coefficient of variation of so many successive samples, in linear response.
+def log_variation_sd(
+    task: AbstractTask, settings: SpectrumSettings, samples: int
+) -> Float[Array, ""]:
+    """Standard deviation of the log of the coefficient of variation of so many successive samples,
+    in linear response.
 
-    For low-passed Gaussian noise of autocovariance r and a line of mean square h at the frequency f, s² that of both,
+    For low-passed Gaussian noise of autocovariance r and a line of mean square h at the frequency
+    f, s² that of both,
 
-        Var s² = 2/n Σ_l (1 - |l|/n) r̃(lΔ)² + 4h/n Σ_l (1 - |l|/n) r̃(lΔ) cos(2πf lΔ),    r̃ = r - Var(mean),
+        Var s² = 2/n Σ_l (1 - |l|/n) r̃(lΔ)² + 4h/n Σ_l (1 - |l|/n) r̃(lΔ) cos(2πf lΔ)
+        r̃ = r - Var(mean),
 
-    and sd(ln CV) = √(Var s²) / (2 s²). How the mean scatters is left out: it counts as CV² beside this.
+    and sd(ln CV) = √(Var s²) / (2 s²). How the mean scatters is left out: it counts as CV² beside
+    this.
     """
     most = LAGS
     while most < samples:
@@ -213,7 +250,8 @@ def log_variation_sd(task: AbstractTask, settings: SpectrumSettings, samples: in
 def _log_variation_sd(
     task: AbstractTask, settings: SpectrumSettings, samples: Int[Array | np.ndarray, ""], most: int
 ) -> Float[Array, ""]:
-    """Of any number of samples up to the `most`, in one program: trials are rarely of one length."""
+    """Of any number of samples up to the `most`, in one program: trials are rarely of one
+    length."""
     system = linearise(task)
     spread = jnp.asarray(low_pass_spread(settings), system.A.dtype)
     reach = len(spread) // 2
@@ -229,21 +267,31 @@ def _log_variation_sd(
     return 0.5 * jnp.sqrt(variance) / (r[0] + swing)
 
 
-def linear_spectrum(task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float] = WINDOW) -> Spectrum:
-    """The expected Welch spectrum in linear response, of tasks that have one; not finite where they have not."""
+def linear_spectrum(
+    task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float] = WINDOW
+) -> Spectrum:
+    """The expected Welch spectrum in linear response, of tasks that have one; not finite where they
+    have not."""
     moments, _ = expected_moments(task, settings, window)
     frequency = jnp.asarray(settings.frequency, moments.power.dtype)
     return Spectrum(frequency, moments.power, settings, task.output_unit)
 
 
 def check_power(task: AbstractTask, moments: Moments) -> None:
-    """Refuse a spectrum that is zero but for rounding: fluctuations below the last digits of the mean."""
+    """Refuse a spectrum that is zero but for rounding: fluctuations below the last digits of the
+    mean."""
     power, mean = np.asarray(moments.power), float(moments.mean)
     least = max(1e3 * np.finfo(power.dtype).eps * abs(mean), ROUNDING) ** 2
     if not np.sum(power) * task.settings.resolution > least:
         idle = "P_w" in task.parameter_names and float(task["P_w"]) == 0
-        why = "P_w is 0, so that nothing stretches the muscle; set P_w above 0" if idle else (
-            f"it has neither noise nor a harmonic that moves {task.output_name}; set noise_K_w, say")  # fmt: skip
+        why = (
+            "P_w is 0, so that nothing stretches the muscle; set P_w above 0"
+            if idle
+            else (
+                f"it has neither noise nor a harmonic that moves {task.output_name}; set"
+                " noise_K_w, say"
+            )
+        )
         raise ValueError(f"the expected spectrum of this {type(task).__name__} is zero: {why}")
 
 
@@ -251,5 +299,7 @@ def check_line(task: AbstractTask, settings: SpectrumSettings) -> None:
     """Refuse a harmonic that sampling would fold to another frequency."""
     frequency = float(task.harmonic.frequency)
     if frequency >= settings.rate / 2 and float(task.harmonic.amplitude) > 0:
-        raise ValueError(f"harmonic_frequency = {frequency} Hz is not below half the sampling rate of {settings.rate} Hz: "
-                         "raise rate, or set harmonic_amplitude = 0")  # fmt: skip
+        raise ValueError(
+            f"harmonic_frequency = {frequency} Hz is not below half the sampling rate of"
+            f" {settings.rate} Hz: raise rate, or set harmonic_amplitude = 0"
+        )

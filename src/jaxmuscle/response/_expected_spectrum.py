@@ -15,30 +15,37 @@ from ._second_order import warn_beyond
 
 
 def expected_spectrum(
-    task: AbstractTask, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW
+    task: AbstractTask,
+    settings: SpectrumSettings | None = None,
+    window: tuple[float, float] = WINDOW,
 ) -> Spectrum:
-    """The expected Welch spectrum of a task's output, to first order in its perturbations: no Monte Carlo.
+    """The expected Welch spectrum of a task's output, to first order in its perturbations: no Monte
+    Carlo.
 
         jm.expected_spectrum(jm.Isometric(k_w=4e5)).plot()
 
         E_k = Σ_l M_kl r(l Δ) + line_k,    r(τ) = c exp(𝒜 τ) P cᵀ,    𝒜 P + P 𝒜ᵀ + 𝒬 = 0
 
-    𝒜 is the task linearised about its equilibrium together with the filters that shape the noise; M holds window,
-    detrending and low-pass (docs/model.md, *From autocovariance to Welch power*), Δ is the sampling interval, so that
-    aliases are part of it; line_k is the harmonic's response with phase and leakage, all its channels added coherently. The
-    estimate's mean for a process that has forgotten its start; exact where the response is linear, as it is within 0.2 % at
-    human force fluctuations.
+    𝒜 is the task linearised about its equilibrium together with the filters that shape the noise; M
+    holds window, detrending and low-pass (docs/model.md, *From autocovariance to Welch power*), Δ
+    is the sampling interval, so that aliases are part of it; line_k is the harmonic's response with
+    phase and leakage, all its channels added coherently. The estimate's mean for a process that has
+    forgotten its start; exact where the response is linear, as it is within 0.2 % at human force
+    fluctuations.
 
-    **Arguments:** `task`; `settings` (the task's own by default); the analysed `window` [s] (only the harmonic's phase
-    and an envelope that changes depend on it).
+    **Arguments:** `task`; `settings` (the task's own by default); the analysed `window` [s] (only
+    the harmonic's phase and an envelope that changes depend on it).
 
-    **Returns:** a `Spectrum`, power [unit²/Hz] of shape (bins,); differentiable, also under `jit` and `vmap`.
+    **Returns:** a `Spectrum`, power [unit²/Hz] of shape (bins,); differentiable, also under `jit`
+    and `vmap`.
 
-    **Raises:** `OperatingPointError` (a `ValueError`) without a stable, damped equilibrium, and where an input still
-    moves in the window; `ValueError` for a harmonic beyond half the sampling rate and for a task without noise and
-    harmonic. Warns (`FirstOrderWarning`) where the second order adds more than 10 % to a bin, and of coefficients that
-    turn negative. Under a transformation, where values cannot be looked at, nothing is raised: without a stable equilibrium
-    the result is not finite, and all else that would be refused gives numbers without meaning.
+    **Raises:** `OperatingPointError` (a `ValueError`) without a stable, damped equilibrium, and
+    where an input still moves in the window; `ValueError` for a harmonic beyond half the sampling
+    rate and for a task without noise and harmonic. Warns (`FirstOrderWarning`) where the second
+    order adds more than 10 % to a bin, and of coefficients that turn negative. Under a
+    transformation, where values cannot be looked at, nothing is raised: without a stable
+    equilibrium the result is not finite, and all else that would be refused gives numbers without
+    meaning.
     """
     moments, settings = _moments(task, "expected_spectrum(task)", settings, window)
     frequency = jnp.asarray(settings.frequency, moments.power.dtype)
@@ -46,22 +53,27 @@ def expected_spectrum(
 
 
 def expected_variation(
-    task: AbstractTask, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW
+    task: AbstractTask,
+    settings: SpectrumSettings | None = None,
+    window: tuple[float, float] = WINDOW,
 ) -> Float[Array, ""]:
-    """The expected coefficient of variation of a task's output, to first order in its perturbations: no Monte Carlo.
+    """The expected coefficient of variation of a task's output, to first order in its
+    perturbations: no Monte Carlo.
 
         jm.response.expected_variation(jm.Isometric(k_w=4e5))
 
         CV = √E[s²] / |μ|,    E[s²] = r(0) - Var(mean) + ½ h²
 
-    r is the autocovariance of the output behind the low-pass of the settings, s² the variance within the window, μ the
-    output at the operating point, and h the amplitude of the harmonic in the low-passed output. Slow fluctuations count
-    less in a short window, which hardly holds one of their periods.
+    r is the autocovariance of the output behind the low-pass of the settings, s² the variance
+    within the window, μ the output at the operating point, and h the amplitude of the harmonic in
+    the low-passed output. Slow fluctuations count less in a short window, which hardly holds one of
+    their periods.
 
-    **Arguments:** as of `expected_spectrum`; the `window` [s] also says how long the recording is (10 s by default).
+    **Arguments:** as of `expected_spectrum`; the `window` [s] also says how long the recording is
+    (10 s by default).
 
-    **Returns:** a fraction, not a percentage; differentiable, also under `jit` and `vmap`. **Raises** and warns as
-    `expected_spectrum`.
+    **Returns:** a fraction, not a percentage; differentiable, also under `jit` and `vmap`.
+    **Raises** and warns as `expected_spectrum`.
     """
     moments, _ = _moments(task, "expected_variation(task)", settings, window)
     return jnp.sqrt(moments.variance) / jnp.abs(moments.mean)
@@ -74,8 +86,10 @@ def _moments(
     require_task(task, call)
     settings = task.settings if settings is None else settings
     if not isinstance(settings, SpectrumSettings):
-        raise ValueError(f"settings: this is a {type(settings).__name__}; give a jaxmuscle.SpectrumSettings, as "
-                         "SpectrumSettings.named('slow')")  # fmt: skip
+        raise ValueError(
+            f"settings: this is a {type(settings).__name__}; give a jaxmuscle.SpectrumSettings, as "
+            "SpectrumSettings.named('slow')"
+        )
     start, stop = window
     if not 0 <= start < stop:
         raise ValueError(f"window = {window}: give its start and its end [s], 0 <= start < end")

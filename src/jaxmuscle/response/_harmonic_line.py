@@ -19,10 +19,14 @@ from jaxmuscle.spectra._welch import lowpass, spectrum_of
 from ._linearised import Linearisation, linearise
 from ._transfer import harmonic_system, times_i, transfer, turn_of
 
-LONG = 1024  # samples of a segment: beyond, a fast Fourier transform takes the place of matrices, whose size is its square
+# samples of a segment: beyond, a fast Fourier transform takes the place of matrices, whose size is
+# its square
+LONG = 1024
 
 
-def transformed(settings: SpectrumSettings, x: Float[Array, "*some samples"]) -> Complex[Array, "*some bins"]:
+def transformed(
+    settings: SpectrumSettings, x: Float[Array, "*some samples"]
+) -> Complex[Array, "*some bins"]:
     """Fourier transform of segments, at the bins."""
     return jnp.fft.rfft(x)[..., settings.first_bin : settings.last_bin + 1]
 
@@ -30,13 +34,19 @@ def transformed(settings: SpectrumSettings, x: Float[Array, "*some samples"]) ->
 def removed(settings: SpectrumSettings) -> Float[np.ndarray, "directions samples"]:
     """What detrending removes of a segment: orthonormal directions."""
     m = np.arange(settings.length) - (settings.length - 1) / 2
-    rows = {"none": [], "constant": [np.ones_like(m)], "linear": [np.ones_like(m), m]}[settings.detrend]
+    rows = {"none": [], "constant": [np.ones_like(m)], "linear": [np.ones_like(m), m]}[
+        settings.detrend
+    ]
     return np.array([row / np.linalg.norm(row) for row in rows]).reshape(-1, settings.length)
 
 
-def _ordinates(settings: SpectrumSettings, x: Float[Array, " samples"]) -> Complex[Array, "bins tapers"]:
+def _ordinates(
+    settings: SpectrumSettings, x: Float[Array, " samples"]
+) -> Complex[Array, "bins tapers"]:
     """`bin_rows(settings) @ x` of a long segment."""
-    away, tapers = (jnp.asarray(a, x.dtype) for a in (removed(settings), tapers_of(settings, settings.length)))
+    away, tapers = (
+        jnp.asarray(a, x.dtype) for a in (removed(settings), tapers_of(settings, settings.length))
+    )
     found = transformed(settings, tapers * (x - away.T @ (away @ x))).T
     return found * jnp.asarray(np.sqrt(sides_of(settings))[:, None], found.dtype)
 
@@ -52,7 +62,8 @@ def _low_pass(settings: SpectrumSettings, turn: Complex[Array, ""]) -> Complex[A
 
 
 def _sampled(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
-    """What sampling does to a line that turns by `angle` in an interval: the average before each sample, or the filter."""
+    """What sampling does to a line that turns by `angle` in an interval: the average before each
+    sample, or the filter."""
     if sampling == "average":
         return (1 - turn_of(-angle)) / times_i(angle)
     taps = anti_alias(FINER) if sampling == "filtered" else np.ones(1)
@@ -63,8 +74,8 @@ def _sampled(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
 class LineTable(NamedTuple):
     """What a line `Im(r e^(iωt))`, r = x + iy, of one frequency gives.
 
-    Welch power `level · (x² + y², x² - y², 2xy)` in every bin, phase and leakage included; variance of a recording
-    `½ |r|² passed - ½ Re(r² twice) - Im(r once)²`; both after the low-pass.
+    Welch power `level · (x² + y², x² - y², 2xy)` in every bin, phase and leakage included; variance
+    of a recording `½ |r|² passed - ½ Re(r² twice) - Im(r once)²`; both after the low-pass.
     """
 
     level: Float[Array, "3 bins *frequencies"]
@@ -75,20 +86,28 @@ class LineTable(NamedTuple):
     def power(self, reply: Complex[Array, "*frequencies"]) -> Float[Array, "bins *frequencies"]:
         """Welch power of every bin, in the precision of `level`."""
         x, y = jnp.real(reply), jnp.imag(reply)
-        steady, turning, turned = (part.astype(self.level.dtype) for part in (x**2 + y**2, x**2 - y**2, 2 * x * y))
-        return jnp.maximum(steady * self.level[0] + turning * self.level[1] + turned * self.level[2], 0.0)
+        steady, turning, turned = (
+            part.astype(self.level.dtype) for part in (x**2 + y**2, x**2 - y**2, 2 * x * y)
+        )
+        return jnp.maximum(
+            steady * self.level[0] + turning * self.level[1] + turned * self.level[2], 0.0
+        )
 
     def variance(self, reply: Complex[Array, "*frequencies"]) -> Float[Array, "*frequencies"]:
         """Variance of the recording."""
-        return 0.5 * (jnp.abs(reply) ** 2 * self.passed - jnp.real(reply**2 * self.twice)) - jnp.imag(reply * self.once) ** 2
+        return (
+            0.5 * (jnp.abs(reply) ** 2 * self.passed - jnp.real(reply**2 * self.twice))
+            - jnp.imag(reply * self.once) ** 2
+        )
 
 
 @kept
 def line_levels(
     task: AbstractTask, settings: SpectrumSettings, frequency: Float[Array | np.ndarray, " lines"]
 ) -> tuple[Float[Array, "lines bins"], Float[Array, " lines"]]:
-    """Of lines of these frequencies [Hz] in the output: Welch power of a mean square of 1 behind the low-pass, the phase
-    averaged; and the mean square behind the low-pass that a harmonic of amplitude √2 has."""
+    """Of lines of these frequencies [Hz] in the output: Welch power of a mean square of 1 behind
+    the low-pass, the phase averaged; and the mean square behind the low-pass that a harmonic of
+    amplitude √2 has."""
     system = harmonic_system(task, linearise(task))
 
     def one(f):
@@ -99,7 +118,9 @@ def line_levels(
     return jax.lax.map(one, jnp.asarray(frequency))
 
 
-def _turns(turns: Float[Array, ""], start: int, samples: Int[Array | np.ndarray, ""] | int) -> Complex[Array, ""]:
+def _turns(
+    turns: Float[Array, ""], start: int, samples: Int[Array | np.ndarray, ""] | int
+) -> Complex[Array, ""]:
     """Mean of `exp(2πi turns m)` over so many successive m from `start` on."""
     n = jnp.asarray(samples, turns.dtype)
     size = jnp.sinc(n * turns) / jnp.sinc(turns)
@@ -113,22 +134,28 @@ def line_table(
     frequency: Float[Array, ""],
     samples: Int[Array | np.ndarray, ""] | int,
 ) -> LineTable:
-    """The table for one frequency [Hz]: the line is sampled, low-passed, cut into segments, tapered and transformed.
+    """The table for one frequency [Hz]: the line is sampled, low-passed, cut into segments, tapered
+    and transformed.
 
-    Segments are those of the window; its variance is that of so many samples from the window's begin on.
+    Segments are those of the window; its variance is that of so many samples from the window's
+    begin on.
     """
     return _differentiable(settings, window, frequency, jnp.asarray(samples))
 
 
 def _table(
-    settings: SpectrumSettings, window: tuple[float, float], frequency: Float[Array, ""], samples: Int[Array, ""]
+    settings: SpectrumSettings,
+    window: tuple[float, float],
+    frequency: Float[Array, ""],
+    samples: Int[Array, ""],
 ) -> LineTable:
     angle = 2 * jnp.pi * frequency / settings.rate
     turn, gain = turn_of(angle), _sampled(angle, settings.sampling)
     start, stop = (round(edge * settings.rate) for edge in window)
     begins = start + settings.step * np.arange(settings.segments(stop - start))
-    # With ahead, behind = rows @ e^(±i angle m) and z the same of the real and of the imaginary rows, which takes no complex
-    # product: Σ |ahead|² + |behind|² = 2 Σ |z|² and Σ ahead conj(behind) = Σ z².
+    # With ahead, behind = rows @ e^(±i angle m) and z the same of the real and of the imaginary
+    # rows, which takes no complex product: Σ |ahead|² + |behind|² = 2 Σ |z|² and Σ ahead
+    # conj(behind) = Σ z².
     spin = angle * np.arange(settings.length, dtype=angle.dtype)
     if settings.length > LONG:
         cos, sin = (_ordinates(settings, wave(spin)) for wave in (jnp.cos, jnp.sin))
@@ -143,7 +170,9 @@ def _table(
     both = jnp.sum(z**2, axis=1)
     turning = 0.5 * through**2 * jnp.mean(turn_of(2 * angle * begins.astype(angle.dtype))) * both
     level = jnp.stack([level, -jnp.real(turning), jnp.imag(turning)])
-    once, twice = (through**k * _turns(k * frequency / settings.rate, start, samples) for k in (1, 2))
+    once, twice = (
+        through**k * _turns(k * frequency / settings.rate, start, samples) for k in (1, 2)
+    )
     return LineTable(level, jnp.abs(through) ** 2, once, twice)
 
 
@@ -151,8 +180,11 @@ _differentiable = jax.custom_jvp(_table, nondiff_argnums=(0, 1))
 
 
 @_differentiable.defjvp
-def _slope_of_table(settings: SpectrumSettings, window: tuple[float, float], at: Any, towards: Any) -> tuple[Any, Any]:
-    """The table depends on one number. So its slope is computed once, for however many directions."""
+def _slope_of_table(
+    settings: SpectrumSettings, window: tuple[float, float], at: Any, towards: Any
+) -> tuple[Any, Any]:
+    """The table depends on one number. So its slope is computed once, for however many
+    directions."""
     frequency, samples = at
     one = jnp.ones_like(frequency)
     table, slope = jax.jvp(lambda f: _table(settings, window, f, samples), (frequency,), (one,))
@@ -166,7 +198,8 @@ def harmonic_line(
     window: tuple[float, float],
     samples: Int[Array | np.ndarray, ""] | int,
 ) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
-    """Welch power of the harmonic's response, phase and leakage included, and its variance in a recording.
+    """Welch power of the harmonic's response, phase and leakage included, and its variance in a
+    recording.
 
     With an envelope that changes, its variance in the window.
     """
@@ -175,7 +208,9 @@ def harmonic_line(
         return _enveloped_line(task, system, settings, window)
     frequency = jnp.asarray(harmonic.frequency, system.A.dtype)
     table = line_table(settings, window, frequency, samples)
-    reply = harmonic_size(task, system.A.dtype) * transfer(harmonic_system(task, system), 2 * jnp.pi * frequency)
+    reply = harmonic_size(task, system.A.dtype) * transfer(
+        harmonic_system(task, system), 2 * jnp.pi * frequency
+    )
     return table.power(reply), table.variance(reply)
 
 
@@ -189,12 +224,16 @@ def harmonic_size(task: AbstractTask, dtype: Any) -> Complex[Array, ""]:
 
 
 def _enveloped_line(
-    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, window: tuple[float, float]
+    task: AbstractTask,
+    system: Linearisation,
+    settings: SpectrumSettings,
+    window: tuple[float, float],
 ) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
-    """The same for an envelope that changes: the deterministic response, slow in the frame that turns with the harmonic.
+    """The same for an envelope that changes: the deterministic response, slow in the frame that
+    turns with the harmonic.
 
-    `Y' = (A - iω) Y + B b a(t)` for y = Im(Y e^{i(ωt + φ)}) is stepped exactly for an envelope a linear between samples,
-    from the steady state of its value at t = 0.
+    `Y' = (A - iω) Y + B b a(t)` for y = Im(Y e^{i(ωt + φ)}) is stepped exactly for an envelope a
+    linear between samples, from the steady state of its value at t = 0.
     """
     harmonic, dtype, A, b, c, d, e = task.harmonic, system.A.dtype, *harmonic_system(task, system)
     omega, interval = 2 * jnp.pi * jnp.asarray(harmonic.frequency, dtype), 1 / settings.rate
@@ -205,7 +244,14 @@ def _enveloped_line(
     n, drive = len(A), b.astype(whirl.dtype)
     turning = A.astype(whirl.dtype) - whirl * jnp.eye(n, dtype=whirl.dtype)
     blocks = jnp.zeros((n + 2, n + 2), whirl.dtype)
-    blocks = blocks.at[:n, :n].set(turning * interval).at[:n, n].set(drive * interval).at[n, n + 1].set(1.0)
+    blocks = (
+        blocks.at[:n, :n]
+        .set(turning * interval)
+        .at[:n, n]
+        .set(drive * interval)
+        .at[n, n + 1]
+        .set(1.0)
+    )
     whole = exponential(blocks)
     step, held, ramp = whole[:n, :n], whole[:n, n], whole[:n, n + 1]
 
@@ -217,7 +263,11 @@ def _enveloped_line(
     first = -jnp.linalg.solve(turning, drive * pairs[0, 0])
     _, later = jax.lax.scan(advance, first, pairs)
     Y = jnp.concatenate([first[None], later])
-    around = turn_of(omega * time + jnp.asarray(harmonic.phase, dtype)) * _sampled(omega * interval, settings.sampling)
+    around = turn_of(omega * time + jnp.asarray(harmonic.phase, dtype)) * _sampled(
+        omega * interval, settings.sampling
+    )
     direct = jax.lax.complex(d * level + e * slope, e * omega * level)
     z = jnp.asarray(harmonic.amplitude, dtype) * jnp.imag((Y @ c.astype(Y.dtype) + direct) * around)
-    return jnp.asarray(spectrum_of(z, settings, window).power), jnp.var(lowpass(z, settings)[start:stop])
+    return jnp.asarray(spectrum_of(z, settings, window).power), jnp.var(
+        lowpass(z, settings)[start:stop]
+    )

@@ -23,7 +23,8 @@ from ._equilibrium import HOLD, equilibrium, mechanics
 
 
 class Linearisation(NamedTuple):
-    """`y' = A (y - point) + B u`, `z = rest + C (y - point) + D u + E u'`: a task about its equilibrium."""
+    """`y' = A (y - point) + B u`, `z = rest + C (y - point) + D u + E u'`: a task about its
+    equilibrium."""
 
     point: Float[Array, " states"]
     rest: Float[Array, ""]
@@ -35,7 +36,8 @@ class Linearisation(NamedTuple):
 
 
 def linearise(task: AbstractTask, time: float = HOLD) -> Linearisation:
-    """Jacobians of the task's own vector field and output at its equilibrium under the inputs at `time` [s].
+    """Jacobians of the task's own vector field and output at its equilibrium under the inputs at
+    `time` [s].
 
     Of a `LinearTask` what it was made of.
     """
@@ -57,7 +59,8 @@ def linearise(task: AbstractTask, time: float = HOLD) -> Linearisation:
 
 
 class LinearTask(AbstractTask):
-    """A task replaced by its linearisation about the equilibrium, where it starts; same noise, harmonic and settings."""
+    """A task replaced by its linearisation about the equilibrium, where it starts; same noise,
+    harmonic and settings."""
 
     system: Linearisation
     state_names: ClassVar[tuple[str, ...]] = ()
@@ -80,25 +83,39 @@ class LinearTask(AbstractTask):
 
     def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
         s = self.system
-        return s.rest + _sum(s.C, [y[i] - s.point[i] for i in range(len(s.A))]) + _sum(s.D, u) + _sum(s.E, du)
+        return (
+            s.rest
+            + _sum(s.C, [y[i] - s.point[i] for i in range(len(s.A))])
+            + _sum(s.D, u)
+            + _sum(s.E, du)
+        )
 
 
 def _sum(row: Array, values: Any) -> Array:
-    """Their product, term by term: in a loop over many seeds XLA makes vectors of that, not of small matrices."""
+    """Their product, term by term: in a loop over many seeds XLA makes vectors of that, not of
+    small matrices."""
     return functools.reduce(operator.add, (row[i] * values[i] for i in range(len(row))))
 
 
 def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
-    """The task with its inputs held at their values at `time` [s] from the start, and starting from equilibrium.
+    """The task with its inputs held at their values at `time` [s] from the start, and starting from
+    equilibrium.
 
         run = jm.simulate(jm.settled(jm.Isometric()), jax.random.key(0), duration=10.0)
 
     Its simulation has no rise and no transient of the mean: what the linear response describes.
     """
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
-    point = equilibrium(task, time) if traced else np.asarray(linearisation(mechanics(task), time).point).tolist()
+    point = (
+        equilibrium(task, time)
+        if traced
+        else np.asarray(linearisation(mechanics(task), time).point).tolist()
+    )
     levels = _inputs(_signals(as_arrays(task)), np.array([time]))
-    held = {name: Constant(level[0] if traced else float(np.asarray(level)[0])) for name, level in levels.items()}
+    held = {
+        name: Constant(level[0] if traced else float(np.asarray(level)[0]))
+        for name, level in levels.items()
+    }
     found = task.with_parts(**held, initial=tuple(point))
     return found if traced else as_numbers(found)
 
@@ -126,14 +143,15 @@ def linearised(task: AbstractTask, time: float = HOLD) -> LinearTask:
 
 
 def check_equilibrium(task: Any, point: np.ndarray, A: np.ndarray) -> float:
-    """The slowest decay rate [1/s]; refuses what has no linear response: no equilibrium, an unstable or undamped one."""
+    """The slowest decay rate [1/s]; refuses what has no linear response: no equilibrium, an
+    unstable or undamped one."""
     name = type(task).__name__
     if not (np.all(np.isfinite(point)) and np.all(np.isfinite(A))):
         with jax.ensure_compile_time_eval():
             base = np.asarray(as_arrays(task).muscle.base())
         raise OperatingPointError(
-            f"{name} has no equilibrium at t = {HOLD} s under its inputs (K_w0, K_z0, C_w0, C_z0 = {base}): "
-            "a stiffness must balance them"
+            f"{name} has no equilibrium at t = {HOLD} s under its inputs (K_w0, K_z0, C_w0, C_z0 ="
+            f" {base}): a stiffness must balance them"
         )
     eigenvalues = np.linalg.eigvals(A)
     margin = 1e3 * np.finfo(A.dtype).eps * np.abs(eigenvalues).max()
@@ -141,8 +159,9 @@ def check_equilibrium(task: Any, point: np.ndarray, A: np.ndarray) -> float:
         kind = "unstable" if eigenvalues.real.max() > margin else "undamped"
         listed = ", ".join(f"{v:.4g}" for v in eigenvalues)
         raise OperatingPointError(
-            f"the equilibrium of this {name} is {kind}: eigenvalues {listed} 1/s at {point}; a linear response needs "
-            f"damping at rest (c_w, c_z, v_ref_w, v_ref_z > 0) and stiffness (k_w, x_ref_w > 0)"
+            f"the equilibrium of this {name} is {kind}: eigenvalues {listed} 1/s at {point}; a"
+            " linear response needs damping at rest (c_w, c_z, v_ref_w, v_ref_z > 0) and stiffness"
+            " (k_w, x_ref_w > 0)"
         )
     return float(-eigenvalues.real.max())
 
@@ -157,21 +176,26 @@ def check_inputs(task: AbstractTask, window: tuple[float, float] = WINDOW) -> No
         return
     times = np.append(np.linspace(*window, LOOKS), HOLD)
     with jax.enable_x64(True):
-        seen = {name: np.asarray(values) for name, values in _inputs(_signals(as_doubles(task)), times).items()}
+        seen = {
+            name: np.asarray(values)
+            for name, values in _inputs(_signals(as_doubles(task)), times).items()
+        }
     for name, values in seen.items():
         off = np.abs(values[:-1] - values[-1])
         if np.max(off) > MOVING * np.max(np.abs(values)):
             when = times[np.argmax(off)]
             raise OperatingPointError(
-                f"{name} of this {type(task).__name__} moves in the analysed window: at {when:.3g} s it is "
-                f"{values[np.argmax(off)]:.3g}, at the end {values[-1]:.3g}. The linear response needs inputs that are held "
-                f"from {window[0]:g} s to {window[1]:g} s. Simulate instead, ensemble(task, key).spectrum(), or fit with "
-                "method='montecarlo'; or hold the input: settled(task)"
+                f"{name} of this {type(task).__name__} moves in the analysed window: at {when:.3g}"
+                f" s it is {values[np.argmax(off)]:.3g}, at the end {values[-1]:.3g}. The linear"
+                f" response needs inputs that are held from {window[0]:g} s to {window[1]:g} s."
+                " Simulate instead, ensemble(task, key).spectrum(), or fit with"
+                " method='montecarlo'; or hold the input: settled(task)"
             )
 
 
 def has_response(task: AbstractTask, *, required: bool) -> bool:
-    """Whether a task has a stable, damped equilibrium under held inputs; with `required`, why not is an error."""
+    """Whether a task has a stable, damped equilibrium under held inputs; with `required`, why not
+    is an error."""
     with jax.enable_x64(True):
         system = linearisation(mechanics(task))
         try:

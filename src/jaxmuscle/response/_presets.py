@@ -33,12 +33,14 @@ def load_preset(name_or_path: str | Path) -> AbstractTask:
         mean = 40.5
         unit = "N"          # or "mN", "kN", "kgf", "gf", "lbf"
 
-    Then the task is scaled to that force by `at_force`: P_w and F_ext, masses, stiffness and damping are multiplied by one
-    number. Proportional power and the coefficient of variation stay. A fit that starts from the task has its priors centred
-    on the new values. A file of `save_preset` and a `fit.json` hold the final numbers and state no mean.
+    Then the task is scaled to that force by `at_force`: P_w and F_ext, masses, stiffness and
+    damping are multiplied by one number. Proportional power and the coefficient of variation stay.
+    A fit that starts from the task has its priors centred on the new values. A file of
+    `save_preset` and a `fit.json` hold the final numbers and state no mean.
 
-    **Raises:** `PresetError` naming the file or the nearest bundled name, and what is wrong: also a unit that is not one of
-    these, a mean of zero or of the other sign, and a task whose output is not a force.
+    **Raises:** `PresetError` naming the file or the nearest bundled name, and what is wrong: also a
+    unit that is not one of these, a mean of zero or of the other sign, and a task whose output is
+    not a force.
     """
     if not isinstance(name_or_path, str | os.PathLike):
         raise PresetError(f"preset {name_or_path!r}: give the name of a bundled preset or a path")
@@ -47,7 +49,9 @@ def load_preset(name_or_path: str | Path) -> AbstractTask:
         return _task_of(_checked(bundled_text(name, "presets"), name, "TOML"), name)
     path = expanded(name)
     if not path.suffix and not path.exists():
-        raise PresetError(f"unknown preset {name!r}: {choices(name, list_presets())}; or give a path")
+        raise PresetError(
+            f"unknown preset {name!r}: {choices(name, list_presets())}; or give a path"
+        )
     kind = "JSON" if path.suffix.lower() == ".json" else "TOML"
     text = read_text(path, PresetError, instead="a preset (.toml) or a fit.json")
     return _task_of(_checked(text, str(path), kind), str(path))
@@ -67,9 +71,16 @@ class PresetFile(Table, kw_only=True):
         ),
     ] = None
     unit: Annotated[
-        Any, says("Unit of `mean`: N, mN, kN, kgf, gf or lbf", missing="not scaled; an error beside `mean`", kind="text")
+        Any,
+        says(
+            "Unit of `mean`: N, mN, kN, kgf, gf or lbf",
+            missing="not scaled; an error beside `mean`",
+            kind="text",
+        ),
     ] = None
-    fit: Annotated[Any, says("How it was fitted: a note for the reader, not used", missing="no note")] = None
+    fit: Annotated[
+        Any, says("How it was fitted: a note for the reader, not used", missing="no note")
+    ] = None
     task_table: Annotated[dict[str, Any], says("The task, every number of it")]
 
 
@@ -92,7 +103,8 @@ def _checked(text: str, file: str, kind: str) -> PresetFile | _InFit:
         formats = table.get("format")
         if type(formats) is not int or formats not in FIT_FORMATS:
             raise PresetError(
-                f"{file}: format = {formats!r}: is not a fit.json of format {' or '.join(map(str, FIT_FORMATS))}"
+                f"{file}: format = {formats!r}: is not a fit.json of format"
+                f" {' or '.join(map(str, FIT_FORMATS))}"
             )
         return _InFit(formats - 1, table["task_table"])
     return checked(table, PresetFile, file, PresetError)
@@ -101,7 +113,11 @@ def _checked(text: str, file: str, kind: str) -> PresetFile | _InFit:
 def _task_of(said: PresetFile | _InFit, file: str) -> AbstractTask:
     try:
         task = task_from_table(said.task_table, whole=said.format > 1)
-        return task if said.mean is None and said.unit is None else _carried(task, said.mean, said.unit)
+        return (
+            task
+            if said.mean is None and said.unit is None
+            else _carried(task, said.mean, said.unit)
+        )
     except ValueError as error:
         raise PresetError(f"{file}: {error}") from None
 
@@ -110,10 +126,14 @@ def _carried(task: AbstractTask, mean: Any, unit: Any) -> AbstractTask:
     """The task at the mean force that a file states."""
     if mean is None or unit is None:
         missing = "mean" if mean is None else "unit"
-        raise PresetError(f'{missing} is missing: give both, as in mean = 40.5 and unit = "N", or neither')
+        raise PresetError(
+            f'{missing} is missing: give both, as in mean = 40.5 and unit = "N", or neither'
+        )
     if unit not in list(NEWTONS):
-        raise PresetError(f"unit = {unit!r}: the parameters of a task are in newtons; give the mean force in "
-                          f"{', '.join(NEWTONS)}, or leave mean and unit out")  # fmt: skip
+        raise PresetError(
+            f"unit = {unit!r}: the parameters of a task are in newtons; give the mean force in "
+            f"{', '.join(NEWTONS)}, or leave mean and unit out"
+        )
     if isinstance(mean, bool) or not isinstance(mean, int | float) or not math.isfinite(mean):
         raise PresetError(f"mean = {mean!r}: give the mean force in {unit} as one number")
     try:
@@ -122,14 +142,22 @@ def _carried(task: AbstractTask, mean: Any, unit: Any) -> AbstractTask:
         raise PresetError(f"mean = {mean} {unit}: {error}") from None
 
 
-def save_preset(path: str | Path, task: AbstractTask, *, description: str = "", fit: dict[str, Any] | None = None) -> None:
+def save_preset(
+    path: str | Path,
+    task: AbstractTask,
+    *,
+    description: str = "",
+    fit: dict[str, Any] | None = None,
+) -> None:
     """Write a task to `path` as a preset: TOML with a description and the task table.
 
         jm.save_preset("mine.toml", jm.Isometric(k_w=4e5))
         task = jm.load_preset("mine.toml")
 
-    `load_preset` reads it back equal. `fit`, a dictionary that says how the task was fitted, is written as a note for the
-    reader.
+    `load_preset` reads it back equal. `fit`, a dictionary that says how the task was fitted, is
+    written as a note for the reader.
     """
-    table: dict[str, Any] = {"format": FORMAT, "description": description} | ({"fit": fit} if fit else {})
+    table: dict[str, Any] = {"format": FORMAT, "description": description} | (
+        {"fit": fit} if fit else {}
+    )
     write_text(path, tomli_w.dumps(table | {"task_table": task_to_table(task)}))

@@ -1,4 +1,5 @@
-"""The same muscle at another level of contraction, or of another size: scaling laws, derived in docs/scaling.md."""
+"""The same muscle at another level of contraction, or of another size: scaling laws, derived in
+docs/scaling.md."""
 
 import dataclasses
 import math
@@ -25,22 +26,30 @@ NO_FORCE = 1e-15  # N, below which a mean force is rounding
 SIZES_OF_A_SIGNAL = ("level", "initial", "final")
 
 
-def relative_variation(mvc_fraction: Scalar, *, steadiest: Scalar = 0.3, contrast: Scalar = 1.0) -> Scalar:
-    """Coefficient of variation of force at a level L (`mvc_fraction`) over that at the steadiest level `L*` (`steadiest`).
+def relative_variation(
+    mvc_fraction: Scalar, *, steadiest: Scalar = 0.3, contrast: Scalar = 1.0
+) -> Scalar:
+    """Coefficient of variation of force at a level L (`mvc_fraction`) over that at the steadiest
+    level `L*` (`steadiest`).
 
         jm.response.relative_variation(0.95)
 
         g(L) = (L*/L · exp(L/L* - 1))^contrast
 
-    With `contrast = 1` the standard deviation grows as `exp(L/L*)`; the smallest coefficient of variation is at `L*`,
-    whatever the contrast. The largest of 5 to 95 % MVC is at 95 % for `L* < 0.305`.
+    With `contrast = 1` the standard deviation grows as `exp(L/L*)`; the smallest coefficient of
+    variation is at `L*`, whatever the contrast. The largest of 5 to 95 % MVC is at 95 % for `L* <
+    0.305`.
 
-    **Source:** standard deviation exponential in force: Slifkin & Newell 1999, doi:10.1037/0096-1523.25.3.837; `L* = 0.3`:
-    Taylor, Christou & Enoka 2003, doi:10.1152/jn.00056.2003.
+    **Source:** standard deviation exponential in force: Slifkin & Newell 1999,
+    doi:10.1037/0096-1523.25.3.837; `L* = 0.3`: Taylor, Christou & Enoka 2003,
+    doi:10.1152/jn.00056.2003.
     """
     _check_fraction("mvc_fraction", mvc_fraction)
     _check_fraction("steadiest", steadiest)
-    require(contrast >= 0, f"contrast = {contrast} must not be negative: 0 is the same variation at every level")
+    require(
+        contrast >= 0,
+        f"contrast = {contrast} must not be negative: 0 is the same variation at every level",
+    )
     ratio = _number(mvc_fraction) / _number(steadiest)
     exp: Any = math.exp if isinstance(ratio, float) else jnp.exp
     return (exp(ratio - 1) / ratio) ** _number(contrast)
@@ -56,136 +65,193 @@ def at_level(
     resting: Scalar = 0.0,
     damping: Scalar = 1.0,
 ) -> AbstractTask:
-    """The task at another level of contraction, `mvc_fraction` L; as it is, it stands for `reference` L₀.
+    """The task at another level of contraction, `mvc_fraction` L; as it is, it stands for
+    `reference` L₀.
 
         strong = jm.at_level(jm.Isometric(), 0.6)
 
         P_w, F_ext ∝ L,   k_j ∝ κ(L) = resting + (1 - resting) L,   c_j ∝ κ(L)^damping
         coefficient of variation of the output ∝ g(L) = relative_variation(L)
 
-    The last is what has been measured; all amplitudes of noise and harmonic are multiplied by the one number that makes
-    the expected (linear-response) value follow it, from the task's own at L₀. With `resting = 0` the operating point does
-    not move and force is proportional to L. `at_level(task, reference)` is the task; two steps make one. It means the
-    same in every task: P_w is prescribed in `Isometric` and `PrescribedForce`, in `PrescribedMotion` it follows from F_ext.
+    The last is what has been measured; all amplitudes of noise and harmonic are multiplied by the
+    one number that makes the expected (linear-response) value follow it, from the task's own at L₀.
+    With `resting = 0` the operating point does not move and force is proportional to L.
+    `at_level(task, reference)` is the task; two steps make one. It means the same in every task:
+    P_w is prescribed in `Isometric` and `PrescribedForce`, in `PrescribedMotion` it follows from
+    F_ext.
 
     **Arguments:**
 
-    - `mvc_fraction`, `reference`, `steadiest`: in (0, 1], fractions of the maximum voluntary contraction
+    - `mvc_fraction`, `reference`, `steadiest`: in (0, 1], fractions of the maximum voluntary
+      contraction
     - `contrast` of g
     - `resting` in [0, 1), the share of the stiffness at L = 1 that is there without activation
     - `damping`: 1 keeps C/K, 0.5 the damping ratio
 
-    **Returns:** a task of the same kind. **Raises:** `ValueError` for a fraction outside (0, 1] (30 % is 0.3), for a task
-    in which no force is prescribed, for a muscle that is not made of the paper's quadratic laws; `OperatingPointError` (a
-    `ValueError`) where there is no stable equilibrium.
+    **Returns:** a task of the same kind. **Raises:** `ValueError` for a fraction outside (0, 1] (30
+    % is 0.3), for a task in which no force is prescribed, for a muscle that is not made of the
+    paper's quadratic laws; `OperatingPointError` (a `ValueError`) where there is no stable
+    equilibrium.
 
-    **Source:** stiffness proportional to force: Shadmehr & Arbib 1992, doi:10.1007/BF00204111 (muscle without reflexes).
-    Both tissues alike, damping and the noise law: assumptions, see docs/scaling.md.
+    **Source:** stiffness proportional to force: Shadmehr & Arbib 1992, doi:10.1007/BF00204111
+    (muscle without reflexes). Both tissues alike, damping and the noise law: assumptions, see
+    docs/scaling.md.
     """
     _check_fraction("mvc_fraction", mvc_fraction)
     _check_fraction("reference", reference)
-    require((resting >= 0) & (resting < 1), f"resting = {resting} must be in [0, 1): a share of the stiffness at 100 % MVC")
+    require(
+        (resting >= 0) & (resting < 1),
+        f"resting = {resting} must be in [0, 1): a share of the stiffness at 100 % MVC",
+    )
     _check_some_force(task)
-    level, before, resting, damping = (_number(v) for v in (mvc_fraction, reference, resting, damping))
+    level, before, resting, damping = (
+        _number(v) for v in (mvc_fraction, reference, resting, damping)
+    )
     stiffer = (resting + (1 - resting) * level) / (resting + (1 - resting) * before)
-    more, less = (relative_variation(at, steadiest=steadiest, contrast=contrast) for at in (level, before))
-    inputs = {name: _times(getattr(task, name), level / before) for name in FORCES if hasattr(task, name)}
-    moved = _with_coefficients(task.with_parts(**inputs), stiffness=stiffer, damping=stiffer**damping)
+    more, less = (
+        relative_variation(at, steadiest=steadiest, contrast=contrast) for at in (level, before)
+    )
+    inputs = {
+        name: _times(getattr(task, name), level / before) for name in FORCES if hasattr(task, name)
+    }
+    moved = _with_coefficients(
+        task.with_parts(**inputs), stiffness=stiffer, damping=stiffer**damping
+    )
     return _with_variation(moved, task, more / less)
 
 
 def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
-    """The task scaled to another mean force: forces, masses, stiffness and damping multiplied by one number.
+    """The task scaled to another mean force: forces, masses, stiffness and damping multiplied by
+    one number.
 
         task = jm.at_force(jm.Isometric(), 40.5)
 
-        P_w, F_ext, m_j, k_j, c_j ∝ s    (and noise in absolute units),    s = mean / (mean force of the task)
+        P_w, F_ext, m_j, k_j, c_j ∝ s    (and noise in absolute units)
+        s = mean / (mean force of the task)
 
-    Every term of (1a) and (1b) is then s times what it was: displacements, times, proportional power and the coefficient of
-    variation stay to the last digit, forces are s times as large. So a fit that starts from this task has its priors
-    centred on these values, and a mean force in newtons can be data (`fit(..., mean_force=)`).
+    Every term of (1a) and (1b) is then s times what it was: displacements, times, proportional
+    power and the coefficient of variation stay to the last digit, forces are s times as large. So a
+    fit that starts from this task has its priors centred on these values, and a mean force in
+    newtons can be data (`fit(..., mean_force=)`).
 
     **Arguments:** `mean` [N], of the sign of the task's own mean force.
 
-    **Returns:** a task of the same kind. **Raises:** `ValueError` for a task whose output is not a force or has a mean of
-    zero, a `mean` of zero or of the other sign, a muscle that is not made of the paper's quadratic laws;
-    `OperatingPointError` (a `ValueError`) where there is no stable equilibrium.
+    **Returns:** a task of the same kind. **Raises:** `ValueError` for a task whose output is not a
+    force or has a mean of zero, a `mean` of zero or of the other sign, a muscle that is not made of
+    the paper's quadratic laws; `OperatingPointError` (a `ValueError`) where there is no stable
+    equilibrium.
     """
     if task.output_unit != "N":
-        raise ValueError(f"the output of {type(task).__name__} is {task.output_name} in {task.output_unit}, not a force")
+        raise ValueError(
+            f"the output of {type(task).__name__} is {task.output_name} in {task.output_unit}, not"
+            " a force"
+        )
     here = _moments(task).mean
-    require(abs(here) > NO_FORCE, "the mean force of this task is zero, and stays so: give it a P_w or F_ext")
+    require(
+        abs(here) > NO_FORCE,
+        "the mean force of this task is zero, and stays so: give it a P_w or F_ext",
+    )
     factor = _number(mean) / here
-    require(factor > 0, f"the mean force of this task is {here} N: give a mean of the same sign, not {mean} N")
+    require(
+        factor > 0,
+        f"the mean force of this task is {here} N: give a mean of the same sign, not {mean} N",
+    )
     return times_force(task, factor)
 
 
 def times_force(task: AbstractTask, factor: Scalar) -> AbstractTask:
-    """Forces, masses, stiffness and damping (and noise in absolute units) multiplied by one number."""
+    """Forces, masses, stiffness and damping (and noise in absolute units) multiplied by one
+    number."""
     inputs = {name: _times(getattr(task, name), factor) for name in FORCES if hasattr(task, name)}
     moved = _with_coefficients(task.with_parts(**inputs), stiffness=factor, damping=factor)
     moved = moved.replace(m_w=moved["m_w"] * factor, m_z=moved["m_z"] * factor)
-    absolute = [n for part in moved.noise.components if not part.relative for n in names_of(moved, part)]
+    absolute = [
+        n for part in moved.noise.components if not part.relative for n in names_of(moved, part)
+    ]
     return moved.replace(**{name: task[name] * factor for name in absolute})
 
 
 def scaled(
-    task: AbstractTask, size: Scalar, *, time_exponent: Scalar = 1.0, strength_exponent: Scalar = 0.25
+    task: AbstractTask,
+    size: Scalar,
+    *,
+    time_exponent: Scalar = 1.0,
+    strength_exponent: Scalar = 0.25,
 ) -> AbstractTask:
     """A geometrically similar muscle, all lengths multiplied by `size` s, under the same stress.
 
         bigger = jm.scaled(jm.Isometric(), 1.2)
 
-        x_ref, x_z ∝ s,   P_w, F_ext ∝ s²,   m ∝ s³,   K_0 ∝ s (k ∝ 1/s),   C_0 ∝ s^(1 + e),   v_ref ∝ s^(1 - e)
+        x_ref, x_z ∝ s,   P_w, F_ext ∝ s²,   m ∝ s³,   K_0 ∝ s (k ∝ 1/s)
+        C_0 ∝ s^(1 + e),   v_ref ∝ s^(1 - e)
         coefficient of variation of the output ∝ (s²)^(-strength_exponent)
 
-    e, `time_exponent`, says how intrinsic times grow: 1 is dynamic similarity, every rate ∝ 1/s (velocities and damping
-    ratio stay); 0 keeps C/K, as a material of given viscosity would. Strength is s²; 1/2 as exponent is independent motor
-    units, as many as strength asks for. All amplitudes of noise and harmonic are multiplied by the one number that makes
-    the expected coefficient of variation follow. Frequency and cut-off of harmonic and noise, times of inputs and
-    spectrum settings stay: they are the nervous system's and the experimenter's.
+    e, `time_exponent`, says how intrinsic times grow: 1 is dynamic similarity, every rate ∝ 1/s
+    (velocities and damping ratio stay); 0 keeps C/K, as a material of given viscosity would.
+    Strength is s²; 1/2 as exponent is independent motor units, as many as strength asks for. All
+    amplitudes of noise and harmonic are multiplied by the one number that makes the expected
+    coefficient of variation follow. Frequency and cut-off of harmonic and noise, times of inputs
+    and spectrum settings stay: they are the nervous system's and the experimenter's.
 
     **Arguments:** `size` > 0, the ratio of lengths; the two exponents.
 
-    **Returns:** a task of the same kind. **Raises:** `ValueError` for a size that is not positive, for a muscle that is not
-    made of the paper's quadratic laws; `OperatingPointError` (a `ValueError`) where there is no stable equilibrium.
+    **Returns:** a task of the same kind. **Raises:** `ValueError` for a size that is not positive,
+    for a muscle that is not made of the paper's quadratic laws; `OperatingPointError` (a
+    `ValueError`) where there is no stable equilibrium.
 
-    **Source:** times ∝ length: Hill 1950, Sci Prog 38:209-230. Variation falling with strength, mainly by the number of
-    motor units: Hamilton, Jones & Wolpert 2004, doi:10.1007/s00221-004-1856-7. The exponent 0.25 is an assumption, see
-    docs/scaling.md.
+    **Source:** times ∝ length: Hill 1950, Sci Prog 38:209-230. Variation falling with strength,
+    mainly by the number of motor units: Hamilton, Jones & Wolpert 2004,
+    doi:10.1007/s00221-004-1856-7. The exponent 0.25 is an assumption, see docs/scaling.md.
     """
-    require(size > 0, f"size = {size} must be positive: the ratio of lengths, 1 for the same muscle")
+    require(
+        size > 0, f"size = {size} must be positive: the ratio of lengths, 1 for the same muscle"
+    )
     s, slower = _number(size), _number(size) ** _number(time_exponent)
-    parts: dict[str, Any] = {name: _times(getattr(task, name), s**2) for name in FORCES if hasattr(task, name)}
+    parts: dict[str, Any] = {
+        name: _times(getattr(task, name), s**2) for name in FORCES if hasattr(task, name)
+    }
     if hasattr(task, "x_z"):
         parts["x_z"] = _times(getattr(task, "x_z"), s)  # noqa: B009
     if task.initial is not None:
         units = {"m": s, "m/s": s / slower}
-        parts["initial"] = tuple(v * units[unit] for v, unit in zip(task.initial, task.state_units, strict=True))
-    moved = _with_coefficients(task.with_parts(**parts), stiffness=s, damping=s * slower, length=s, velocity=s / slower)
+        parts["initial"] = tuple(
+            v * units[unit] for v, unit in zip(task.initial, task.state_units, strict=True)
+        )
+    moved = _with_coefficients(
+        task.with_parts(**parts), stiffness=s, damping=s * slower, length=s, velocity=s / slower
+    )
     moved = moved.replace(m_w=moved["m_w"] * s**3, m_z=moved["m_z"] * s**3)
     return _with_variation(moved, task, s ** (-2 * _number(strength_exponent)))
 
 
 def _number(value: Any) -> Any:
-    """A Python number, which loses no digits in either precision, unless a transformation is tracing the value."""
+    """A Python number, which loses no digits in either precision, unless a transformation is
+    tracing the value."""
     return float(value) if is_concrete(value) else value
 
 
 def _check_fraction(name: str, value: Scalar) -> None:
-    require((value > 0) & (value <= 1), f"{name} = {value} must be a fraction of the maximum voluntary contraction in "
-            "(0, 1]: 30 % is 0.3")  # fmt: skip
+    require(
+        (value > 0) & (value <= 1),
+        f"{name} = {value} must be a fraction of the maximum voluntary contraction in "
+        "(0, 1]: 30 % is 0.3",
+    )
 
 
 def _check_some_force(task: AbstractTask) -> None:
     """Refuse a task in which nothing says how strongly the muscle contracts."""
     named = [name for name in FORCES if hasattr(task, name)]
     sizes = [
-        getattr(s, field) for s in (getattr(task, n) for n in named) for field in SIZES_OF_A_SIGNAL if hasattr(s, field)
+        getattr(s, field)
+        for s in (getattr(task, n) for n in named)
+        for field in SIZES_OF_A_SIGNAL
+        if hasattr(s, field)
     ]
     if sizes and all(is_concrete(v) and np.all(np.asarray(v) == 0) for v in sizes):
-        raise ValueError(f"{' and '.join(named)} of this {type(task).__name__} = 0: without a force there is no level of "
-                         f"contraction; give {named[0]}")  # fmt: skip
+        raise ValueError(
+            f"{' and '.join(named)} of this {type(task).__name__} = 0: without a force there is no"
+            f" level of contraction; give {named[0]}"
+        )
 
 
 def _times(value: Any, factor: Scalar) -> Any:
@@ -194,33 +260,57 @@ def _times(value: Any, factor: Scalar) -> Any:
         return value * factor
     sizes = [f.name for f in dataclasses.fields(value) if f.name in SIZES_OF_A_SIGNAL]
     if "level" not in sizes:
-        raise ValueError(f"an input of class {type(value).__name__} has no level to multiply: give the class a field level")
+        raise ValueError(
+            f"an input of class {type(value).__name__} has no level to multiply: give the class a"
+            " field level"
+        )
     return dataclasses.replace(value, **{name: getattr(value, name) * factor for name in sizes})
 
 
 def is_scalable(muscle: Any) -> bool:
-    """Whether the muscle is made of the paper's quadratic laws, so that it is known what to multiply."""
-    laws = [type(getattr(muscle, f"{kind}_{j}", None)) for kind in ("stiffness", "damping") for j in "wz"]
+    """Whether the muscle is made of the paper's quadratic laws, so that it is known what to
+    multiply."""
+    laws = [
+        type(getattr(muscle, f"{kind}_{j}", None))
+        for kind in ("stiffness", "damping")
+        for j in "wz"
+    ]
     return isinstance(muscle, Muscle) and laws == [QuadraticStiffness] * 2 + [QuadraticDamping] * 2
 
 
 def _with_coefficients(
-    task: AbstractTask, *, stiffness: Scalar, damping: Scalar, length: Scalar = 1.0, velocity: Scalar = 1.0
+    task: AbstractTask,
+    *,
+    stiffness: Scalar,
+    damping: Scalar,
+    length: Scalar = 1.0,
+    velocity: Scalar = 1.0,
 ) -> AbstractTask:
     """K_j0, C_j0, x_ref and v_ref of both tissues multiplied by the four factors."""
     if not is_scalable(task.muscle):
-        raise ValueError(f"the muscle, a {type(task.muscle).__name__}, is not made of the paper's quadratic laws: change "
-                         "its own parameters with replace(...)")  # fmt: skip
-    factors = {"k": stiffness / length**2, "x_ref": length, "c": damping / velocity**2, "v_ref": velocity}
+        raise ValueError(
+            f"the muscle, a {type(task.muscle).__name__}, is not made of the paper's quadratic"
+            " laws: change its own parameters with replace(...)"
+        )
+    factors = {
+        "k": stiffness / length**2,
+        "x_ref": length,
+        "c": damping / velocity**2,
+        "v_ref": velocity,
+    }
     names = [(f"{name}_{j}", factor) for name, factor in factors.items() for j in "wz"]
     return task.replace(**{name: task[name] * factor for name, factor in names})
 
 
 def _with_variation(task: AbstractTask, before: AbstractTask, factor: Scalar) -> AbstractTask:
-    """The task with all amplitudes multiplied so that its coefficient of variation is `factor` times that of `before`."""
+    """The task with all amplitudes multiplied so that its coefficient of variation is `factor`
+    times that of `before`."""
     if task.quantity == "acceleration":
-        raise ValueError("an acceleration has no coefficient of variation, which sets the noise here: move the task with "
-                         "observe='displacement', then change it by with_parts(observe='acceleration')")  # fmt: skip
+        raise ValueError(
+            "an acceleration has no coefficient of variation, which sets the noise here: move the"
+            " task with observe='displacement', then change it by"
+            " with_parts(observe='acceleration')"
+        )
     now, then = _moments(task).variation, _moments(before).variation
     moving = then > 0
     if is_concrete(moving):
@@ -231,7 +321,8 @@ def _with_variation(task: AbstractTask, before: AbstractTask, factor: Scalar) ->
 
 
 def _moments(task: AbstractTask) -> Moments:
-    """Expected moments of the output; its variation is to first order proportional to the amplitudes."""
+    """Expected moments of the output; its variation is to first order proportional to the
+    amplitudes."""
     if not all_concrete(task):
         return expected_moments(task, task.settings, WINDOW)[0]
     with jax.enable_x64(True):

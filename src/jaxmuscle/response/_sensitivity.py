@@ -25,11 +25,12 @@ if TYPE_CHECKING:
 
 
 class Sensitivity(Shown, eqx.Module):
-    """`d ln p_k / d ln v_j` of proportional power p_k with respect to parameters v_j, shape (parameters, bins).
+    """`d ln p_k / d ln v_j` of proportional power p_k with respect to parameters v_j, shape
+    (parameters, bins).
 
-    Where a parameter is zero, or may be negative and so has no logarithm, it is `d ln p_k / d v_j`. `relative` says for
-    every parameter which of the two it is: True for the logarithm.
-    `power` has the same of absolute power; `frequency` [Hz]; `names`, `values` and `units` of the parameters.
+    Where a parameter is zero, or may be negative and so has no logarithm, it is `d ln p_k / d v_j`.
+    `relative` says for every parameter which of the two it is: True for the logarithm. `power` has
+    the same of absolute power; `frequency` [Hz]; `names`, `values` and `units` of the parameters.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -42,11 +43,26 @@ class Sensitivity(Shown, eqx.Module):
 
     def _card(self) -> Card:
         """Of every parameter the bin that changes most, those with a relative change first."""
-        columns, rows, slopes = ("parameter", "value", "largest change of a bin's share of the power"), [], self.proportional
+        columns, rows, slopes = (
+            ("parameter", "value", "largest change of a bin's share of the power"),
+            [],
+            self.proportional,
+        )
         for i in np.lexsort((-np.abs(slopes).max(axis=1), ~np.asarray(self.relative))):
-            k, unit = int(np.argmax(np.abs(slopes[i]))), "" if self.units[i] == "1" else self.units[i]
-            change = f"{slopes[i, k]:+.3g} % for 1 % more" if self.relative[i] else f"{100 * slopes[i, k]:+.3g} % per {unit}"
-            found = f"{change}, at {self.frequency[k]:.3g} Hz" if np.abs(slopes[i, k]) > 1e-9 else "none"
+            k, unit = (
+                int(np.argmax(np.abs(slopes[i]))),
+                "" if self.units[i] == "1" else self.units[i],
+            )
+            change = (
+                f"{slopes[i, k]:+.3g} % for 1 % more"
+                if self.relative[i]
+                else f"{100 * slopes[i, k]:+.3g} % per {unit}"
+            )
+            found = (
+                f"{change}, at {self.frequency[k]:.3g} Hz"
+                if np.abs(slopes[i, k]) > 1e-9
+                else "none"
+            )
             rows.append((self.names[i], f"{self.values[i]:.4g} {unit}".strip(), found))
         heading = "sensitivity of the expected spectrum, the most influential parameter first"
         return Card("\n".join([heading, *in_columns(columns, rows)]), heading, columns, tuple(rows))
@@ -63,7 +79,9 @@ class Sensitivity(Shown, eqx.Module):
             "unit": ("parameter", list(self.units)),
             "relative": ("parameter", self.relative),
         }
-        return xarray.Dataset({"proportional": (dims, self.proportional), "power": (dims, self.power)}, coordinates)
+        return xarray.Dataset(
+            {"proportional": (dims, self.proportional), "power": (dims, self.power)}, coordinates
+        )
 
     def plot(self, ax: Any = None) -> Any:
         """A heat map. Returns the axes."""
@@ -76,7 +94,8 @@ def sensitivity(
     settings: SpectrumSettings | None = None,
     window: tuple[float, float] = WINDOW,
 ) -> Sensitivity:
-    """How every bin of the expected spectrum answers to every parameter, by forward-mode differentiation.
+    """How every bin of the expected spectrum answers to every parameter, by forward-mode
+    differentiation.
 
         jm.sensitivity(jm.Isometric(), ("k_w", "c_w")).plot()
 
@@ -87,7 +106,8 @@ def sensitivity(
     - `settings` (the task's by default)
     - `window` [s]
 
-    **Returns:** a `Sensitivity`. **Raises:** as `expected_spectrum`, and `ValueError` for an unknown name.
+    **Returns:** a `Sensitivity`. **Raises:** as `expected_spectrum`, and `ValueError` for an
+    unknown name.
     """
     settings = task.settings if settings is None else settings
     expected_spectrum(task, settings, window)
@@ -104,7 +124,15 @@ def sensitivity(
     slopes = np.where(relative[:, None], values[:, None], 1.0) * slopes
     bins = len(settings.frequency)
     rows = [(PARAMETERS[n].unit if n in PARAMETERS else "") for n in chosen]
-    return Sensitivity(chosen, tuple(rows), values, relative, settings.frequency, slopes[:, bins:], slopes[:, :bins])
+    return Sensitivity(
+        chosen,
+        tuple(rows),
+        values,
+        relative,
+        settings.frequency,
+        slopes[:, bins:],
+        slopes[:, :bins],
+    )
 
 
 @kept
@@ -112,7 +140,9 @@ def _slopes(task, names, values, settings, window):
     """Jacobian of log power and log proportional power."""
 
     def logs(values):
-        power = response(set_parameters(task, dict(zip(names, values, strict=True))), settings, window)[0].power
+        power = response(
+            set_parameters(task, dict(zip(names, values, strict=True))), settings, window
+        )[0].power
         return jnp.concatenate([jnp.log(power), jnp.log(power / jnp.sum(power))])
 
     return jax.jacfwd(logs)(values)

@@ -26,7 +26,8 @@ def times_i(x: Float[Array, "*any"]) -> Complex[Array, "*any"]:
 
 
 class SignalSystem(NamedTuple):
-    """`y' = A y + b h`, `z = c y + d h + e h'`: the output's response to one signal h, on all the inputs that it moves."""
+    """`y' = A y + b h`, `z = c y + d h + e h'`: the output's response to one signal h, on all the
+    inputs that it moves."""
 
     A: Float[Array, "states states"]
     b: Float[Array, " states"]
@@ -51,10 +52,20 @@ def system_of(task: AbstractTask, system: Linearisation, base: Perturbation) -> 
     later, now = jnp.where(active, base, 0.0), jnp.where(active, 0.0, base)
     own, into = (x.astype(base.dtype) for x in task.activation.states())
     first = jnp.array([1.0, 0.0], base.dtype)
-    A = jnp.block([[system.A, jnp.outer(system.B @ later, first)], [jnp.zeros((2, len(system.A)), base.dtype), own]])
+    A = jnp.block(
+        [
+            [system.A, jnp.outer(system.B @ later, first)],
+            [jnp.zeros((2, len(system.A)), base.dtype), own],
+        ]
+    )
     read = (system.D @ later) * first + (system.E @ later) * own[0]
-    return SignalSystem(A, jnp.concatenate([system.B @ now, into]), jnp.concatenate([system.C, read]),
-                        system.D @ now, system.E @ now)  # fmt: skip
+    return SignalSystem(
+        A,
+        jnp.concatenate([system.B @ now, into]),
+        jnp.concatenate([system.C, read]),
+        system.D @ now,
+        system.E @ now,
+    )
 
 
 def transfer(system: SignalSystem, omega: Float[Array, ""]) -> Complex[Array, ""]:
@@ -66,7 +77,8 @@ def transfer(system: SignalSystem, omega: Float[Array, ""]) -> Complex[Array, ""
 
 
 def polynomials(system: SignalSystem) -> tuple[Array, Array]:
-    """`c (s - A)⁻¹ b + d + s e` as numerator and denominator, highest power first: Faddeev and LeVerrier."""
+    """`c (s - A)⁻¹ b + d + s e` as numerator and denominator, highest power first: Faddeev and
+    LeVerrier."""
     A, b, c, d, e = system
     n, eye = len(A), jnp.eye(len(A), dtype=A.dtype)
     adjoint, below, above = eye, [jnp.ones((), A.dtype)], []
@@ -81,7 +93,9 @@ def polynomials(system: SignalSystem) -> tuple[Array, Array]:
     return inside + through + jnp.concatenate([e * denominator, jnp.zeros(1, A.dtype)]), denominator
 
 
-def polynomial(coefficients: Float[Array, " powers"], s: Complex[Array, "*grid"]) -> Complex[Array, "*grid"]:
+def polynomial(
+    coefficients: Float[Array, " powers"], s: Complex[Array, "*grid"]
+) -> Complex[Array, "*grid"]:
     """Its value at s."""
     value = jnp.zeros_like(s)
     for c in coefficients:
@@ -89,16 +103,21 @@ def polynomial(coefficients: Float[Array, " powers"], s: Complex[Array, "*grid"]
     return value
 
 
-def half_power_level(task: AbstractTask, system: Linearisation, log_f: Float[Array, "*any"]) -> Float[Array, "*any"]:
+def half_power_level(
+    task: AbstractTask, system: Linearisation, log_f: Float[Array, "*any"]
+) -> Float[Array, "*any"]:
     """`ln(2 |H(f)|² / |H(0)|²)`, H the response to noise on K_w: zero where half its power is left.
 
-    Smooth in the parameters everywhere, which the frequency of its first zero is not (docs/fitting.md).
+    Smooth in the parameters everywhere, which the frequency of its first zero is not
+    (docs/fitting.md).
     """
     return _level(log_f, *_active_response(task, system))
 
 
 def _active_response(task: AbstractTask, system: Linearisation) -> tuple[Array, Array]:
-    return polynomials(system_of(task, system, jnp.zeros(5, system.A.dtype).at[0].set(task.muscle.base()[0])))
+    return polynomials(
+        system_of(task, system, jnp.zeros(5, system.A.dtype).at[0].set(task.muscle.base()[0]))
+    )
 
 
 def _level(log_f: Float[Array, "*any"], above: Array, below: Array) -> Float[Array, "*any"]:
@@ -108,10 +127,12 @@ def _level(log_f: Float[Array, "*any"], above: Array, below: Array) -> Float[Arr
 
 
 def half_power_frequency(task: AbstractTask, system: Linearisation) -> Float[Array, ""]:
-    """Frequency [Hz] at which white noise on K_w has fallen to half its power at 0: relaxation and activation together.
+    """Frequency [Hz] at which white noise on K_w has fallen to half its power at 0: relaxation and
+    activation together.
 
-    The lowest one between 1 mHz and 100 Hz; not a number where there is none. Between two points of a grid, then by one
-    Newton step, the only one that is differentiated (the implicit function theorem), with the slope of the grid.
+    The lowest one between 1 mHz and 100 Hz; not a number where there is none. Between two points of
+    a grid, then by one Newton step, the only one that is differentiated (the implicit function
+    theorem), with the slope of the grid.
     """
     above, below = _active_response(task, system)
     grid = jnp.linspace(np.log(1e-3), np.log(100.0), POINTS)

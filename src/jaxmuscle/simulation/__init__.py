@@ -1,4 +1,5 @@
-"""Solutions of the stochastic differential equation: one seed or a batch of seeds, and what is read off them.
+"""Solutions of the stochastic differential equation: one seed or a batch of seeds, and what is read
+off them.
 
 No linearisation except as control variate.
 """

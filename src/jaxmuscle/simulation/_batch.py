@@ -1,4 +1,5 @@
-"""One chunk of an ensemble: the compiled program for some points and seeds, shared by the devices of this process."""
+"""One chunk of an ensemble: the compiled program for some points and seeds, shared by the devices
+of this process."""
 
 from typing import Any
 
@@ -24,16 +25,18 @@ from ._grid import Grid
 
 LANES = 1024
 THREADED = ("cpu",)  # backends whose devices are cores
-# In these versions of JAX an FFT waits for other threads of XLA's pool. If all of them wait, none goes on.
+# In these versions of JAX an FFT waits for other threads of XLA's pool. If all of them wait, none
+# goes on.
 WAITING = ("0.11.1", "0.11.2")
 
 
 class Recipe(eqx.Module):
-    """What is computed of a seed: on which grid, sampled how, with states or not, Welch power and variation over `edges`.
+    """What is computed of a seed: on which grid, sampled how, with states or not, Welch power and
+    variation over `edges`.
 
-    A device simulates at most `lanes` seeds side by side, what is more one block after the other. `every` is the ratio of
-    the run's rate to the spectrum's; `edges` [samples] are None where no spectrum is asked for. `draws`: which random
-    numbers.
+    A device simulates at most `lanes` seeds side by side, what is more one block after the other.
+    `every` is the ratio of the run's rate to the spectrum's; `edges` [samples] are None where no
+    spectrum is asked for. `draws`: which random numbers.
     """
 
     grid: Grid
@@ -47,24 +50,35 @@ class Recipe(eqx.Module):
 
 
 def local_mesh() -> Mesh | None:
-    """The GPUs of this process as one axis; None if there is one device. Cores of a CPU are shared by threads."""
+    """The GPUs of this process as one axis; None if there is one device. Cores of a CPU are shared
+    by threads."""
     devices = jax.local_devices()
-    return Mesh(np.array(devices), ("lanes",)) if len(devices) > 1 and jax.default_backend() not in THREADED else None
+    return (
+        Mesh(np.array(devices), ("lanes",))
+        if len(devices) > 1 and jax.default_backend() not in THREADED
+        else None
+    )
 
 
 def threads_of(wanted: int | None) -> int:
-    """How many chunks run at the same time: one on each core of a CPU, or as many as wanted; two on other devices."""
+    """How many chunks run at the same time: one on each core of a CPU, or as many as wanted; two on
+    other devices."""
     if jax.default_backend() not in THREADED:
         return 2
     threads = usable_cores() if wanted is None else wanted
     return min(threads, max(1, usable_cores() - 1)) if jax.__version__ in WAITING else threads
 
 
-def respond(task: AbstractTask, source: Stream | Realisation, grid: Grid, sampling: str) -> tuple[Array, Array]:
-    """States (samples, states), at instants, and sampled output (samples) of one noise path, drawn or given."""
+def respond(
+    task: AbstractTask, source: Stream | Realisation, grid: Grid, sampling: str
+) -> tuple[Array, Array]:
+    """States (samples, states), at instants, and sampled output (samples) of one noise path, drawn
+    or given."""
     from ._integrator import integrated  # and diffrax, which a program that is loaded does without
 
-    states, (output,) = integrated((task,), jax.tree.map(lambda x: x[None], source), grid, sampling, states=True)
+    states, (output,) = integrated(
+        (task,), jax.tree.map(lambda x: x[None], source), grid, sampling, states=True
+    )
     assert states is not None
     return states[0], output[0]
 
@@ -78,8 +92,12 @@ def _responses(task: AbstractTask, linear: Any, sources: Stream, recipe: Recipe)
     finite = jnp.all(jnp.isfinite(outputs[0]), axis=1)
     if states is not None:
         finite &= jnp.all(jnp.isfinite(states), axis=(1, 2))
-    found: dict[str, Any] = {"output": outputs[0], "finite": finite, "linear": None if linear is None else outputs[1],
-                             "states": states}  # fmt: skip
+    found: dict[str, Any] = {
+        "output": outputs[0],
+        "finite": finite,
+        "linear": None if linear is None else outputs[1],
+        "states": states,
+    }
     if recipe.edges is not None:
         found["power"], found["variation"] = _seen(found["output"], recipe)
         found["linear_power"] = None if linear is None else _seen(found["linear"], recipe)[0]
@@ -100,7 +118,9 @@ def blocks(seeds: int, lanes: int) -> int:
 
 
 @kept
-def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None) -> dict[str, Any]:
+def run_seeds(
+    task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None
+) -> dict[str, Any]:
     """Output, finiteness and what else the recipe asks for, of one task and every seed."""
 
     def local(arrays, seeds):
@@ -120,7 +140,9 @@ def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh
 
 
 @kept
-def run_points(tasks: Any, linears: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None) -> dict[str, Any]:
+def run_points(
+    tasks: Any, linears: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None
+) -> dict[str, Any]:
     """The same for every task along a leading axis of points; all of them get the same noise."""
 
     def local(moving, key, seeds):

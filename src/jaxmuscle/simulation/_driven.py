@@ -1,4 +1,5 @@
-"""What the force does when the insertion is moved as measured: the nonlinear muscle, without noise."""
+"""What the force does when the insertion is moved as measured: the nonlinear muscle, without
+noise."""
 
 from typing import Any
 
@@ -16,18 +17,23 @@ from jaxmuscle.response._equilibrium import HOLD, equilibrium, fastest_rate
 from ._grid import parts_for
 
 BLOCK = 10_240  # half steps; a program serves all recordings of as many blocks
-LONGEST = 1.4  # of rate times step: half of what keeps the method stable, since damping grows with speed
+# of rate times step: half of what keeps the method stable, since damping grows with speed
+LONGEST = 1.4
 MOST = 256
 
 
-def driven(task: PrescribedLength, motion: Float[np.ndarray, "3 times"], interval: float) -> Float[np.ndarray, " steps"]:
-    """F_ext less its value at rest [N] at every second of some times, by the Runge-Kutta method of order 4.
+def driven(
+    task: PrescribedLength, motion: Float[np.ndarray, "3 times"], interval: float
+) -> Float[np.ndarray, " steps"]:
+    """F_ext less its value at rest [N] at every second of some times, by the Runge-Kutta method of
+    order 4.
 
-    **Arguments:** `task`, whose P_w is held; `motion`: x_z, x_z', x_z'' about the task's own x_z at times `interval` [s]
-    apart, an odd number of them; they begin at rest.
+    **Arguments:** `task`, whose P_w is held; `motion`: x_z, x_z', x_z'' about the task's own x_z at
+    times `interval` [s] apart, an odd number of them; they begin at rest.
 
-    A step, two intervals, is cut into as many parts (a power of two, at most `MOST`) as the fastest rate of the muscle asks
-    for. Within a step the motion is the parabola through its three values. Not finite where that is not enough.
+    A step, two intervals, is cut into as many parts (a power of two, at most `MOST`) as the fastest
+    rate of the muscle asks for. Within a step the motion is the parabola through its three values.
+    Not finite where that is not enough.
     """
     times = motion.shape[1]
     filled = np.pad(motion, ((0, 0), (0, -(times - 1) % BLOCK)))
@@ -57,7 +63,10 @@ def _driven(task: Any, motion: Any, step: Any, parts: int) -> Float[Array, " ste
             d = at(y + short * c, along(begin + 1 / parts))[0]
             return y + short / 6 * (a + 2 * b + 2 * c + d), None
 
-        return jax.lax.scan(part, y, jnp.arange(parts, dtype=motion.dtype) / parts)[0], at(y, first)[1]
+        return (
+            jax.lax.scan(part, y, jnp.arange(parts, dtype=motion.dtype) / parts)[0],
+            at(y, first)[1],
+        )
 
     table, short = motion.T, step / parts
     y, found = jax.lax.scan(advance, start, (table[:-1:2], table[1::2], table[2::2]))

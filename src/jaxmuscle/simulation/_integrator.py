@@ -1,4 +1,5 @@
-"""The integrator: tasks on one noise path of the step grid, and a sub-cycled Heun solver, for diffrax."""
+"""The integrator: tasks on one noise path of the step grid, and a sub-cycled Heun solver, for
+diffrax."""
 
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
@@ -21,10 +22,11 @@ from ._perturbation import Perturbation
 
 
 class Moving(NamedTuple):
-    """The state of the equation: those of every task and of what perturbs them, a vector along the seeds each.
+    """The state of the equation: those of every task and of what perturbs them, a vector along the
+    seeds each.
 
-    So they stay in a cache. `seen`: every task's output after every step of the last interval, where it is not sampled at
-    instants.
+    So they stay in a cache. `seen`: every task's output after every step of the last interval,
+    where it is not sampled at instants.
     """
 
     tasks: tuple[tuple[Array, ...], ...]
@@ -33,9 +35,11 @@ class Moving(NamedTuple):
 
 
 class SubcycledHeun(dfx.AbstractStratonovichSolver):
-    """Heun's method, all steps of a `GridTerm`'s interval in one solver step: second order in the drift.
+    """Heun's method, all steps of a `GridTerm`'s interval in one solver step: second order in the
+    drift.
 
-    One diffrax step per saved sample keeps saving and reverse-mode checkpoints out of the inner loop.
+    One diffrax step per saved sample keeps saving and reverse-mode checkpoints out of the inner
+    loop.
     """
 
     term_structure: ClassVar[Any] = dfx.AbstractTerm
@@ -59,14 +63,17 @@ class SubcycledHeun(dfx.AbstractStratonovichSolver):
 
 
 class GridTerm(dfx.AbstractTerm):
-    """Tasks on the same perturbation, a step after the other: `dy = f(t, y, u) dt + (∂f/∂u) dW`, u by its own recursion.
+    """Tasks on the same perturbation, a step after the other: `dy = f(t, y, u) dt + (∂f/∂u) dW`, u
+    by its own recursion.
 
-    The noise filters and the activation are linear, and advanced exactly. Its control is the number of an interval's first
-    step. Sub-steps share the noise of their step: u is interpolated, dW divided. The steps take the tasks with their inputs
-    `looked_up` in tables, the outputs the tasks themselves, since they may need higher derivatives.
+    The noise filters and the activation are linear, and advanced exactly. Its control is the number
+    of an interval's first step. Sub-steps share the noise of their step: u is interpolated, dW
+    divided. The steps take the tasks with their inputs `looked_up` in tables, the outputs the tasks
+    themselves, since they may need higher derivatives.
 
-    Many seeds at once, what is `own` to each along a leading axis: an interval is mapped over the seeds. Were the whole
-    solution mapped, JAX would trace every loop in it anew for the mapping: more than half of all operations traced.
+    Many seeds at once, what is `own` to each along a leading axis: an interval is mapped over the
+    seeds. Were the whole solution mapped, JAX would trace every loop in it anew for the mapping:
+    more than half of all operations traced.
     """
 
     tasks: tuple[AbstractTask, ...]
@@ -84,7 +91,9 @@ class GridTerm(dfx.AbstractTerm):
 
     def _mapped(self, function, *each):
         """A function of a seed's perturbation and of what else has an axis of seeds."""
-        return jax.vmap(lambda own, *rest: function(eqx.combine(own, self.shared), *rest))(self.own, *each)
+        return jax.vmap(lambda own, *rest: function(eqx.combine(own, self.shared), *rest))(
+            self.own, *each
+        )
 
     def contr(self, t0, t1, **kwargs):
         # diffrax rounds t0, a fraction of the run; step numbers must be whole to find their noise.
@@ -96,19 +105,24 @@ class GridTerm(dfx.AbstractTerm):
         none = jnp.zeros(self.grid.every, jnp.result_type(float))
 
         def one(perturbation):
-            return Moving(states, perturbation.start(), () if self.instants else (none,) * len(self.tasks))
+            return Moving(
+                states, perturbation.start(), () if self.instants else (none,) * len(self.tasks)
+            )
 
         return self._mapped(one)
 
     @eqx.filter_jit  # diffrax asks several times, and so it is traced once
     def vf_prod(self, t, y, args, control):
-        """The state after an interval, not its change: what is advanced exactly has no need of a difference."""
+        """The state after an interval, not its change: what is advanced exactly has no need of a
+        difference."""
 
         def one(perturbation, y):
             def step(state, given):
                 state = self._step(perturbation, *state, *given)
                 number = (given[0] + 1).astype(state[0][0][0].dtype)
-                return state, () if self.instants else self._outputs(perturbation, Moving(*state, ()), number)
+                return state, (
+                    () if self.instants else self._outputs(perturbation, Moving(*state, ()), number)
+                )
 
             numbers = control + jnp.arange(self.grid.every, dtype=jnp.int32)
             made = perturbation.path.ahead(control, self.grid.every)
@@ -120,21 +134,33 @@ class GridTerm(dfx.AbstractTerm):
     def _harmonic(self, step: Scalar) -> Array:
         return self.looked_up[0].harmonic(step * self.grid.dt)
 
-    def _step(self, perturbation: Perturbation, tasks: tuple, path: Any, number: Array, made: Any) -> tuple[tuple, Any]:
+    def _step(
+        self, perturbation: Perturbation, tasks: tuple, path: Any, number: Array, made: Any
+    ) -> tuple[tuple, Any]:
         parts, begun = self.grid.substeps, number.astype(tasks[0][0].dtype)
         wave, later = self._harmonic(begun), self._harmonic(begun + 1)
         after, kicks = perturbation.advance(path, made, wave, later)
         if parts == 1:
             u = perturbation.inputs(path, wave), perturbation.inputs(after, later)
-            return tuple(self._heun(task, y, begun, *u, kicks) for task, y in zip(self.looked_up, tasks, strict=True)), after
-        noise, noise_later = (perturbation.inputs(state, jnp.zeros_like(wave)) for state in (path, after))
+            return (
+                tuple(
+                    self._heun(task, y, begun, *u, kicks)
+                    for task, y in zip(self.looked_up, tasks, strict=True)
+                ),
+                after,
+            )
+        noise, noise_later = (
+            perturbation.inputs(state, jnp.zeros_like(wave)) for state in (path, after)
+        )
         parted = [None if kick is None else kick / parts for kick in kicks]
 
         def inputs(share: Array) -> list[Array]:
             still = self._harmonic(begun + share)
             found = [a + share * (b - a) for a, b in zip(noise, noise_later, strict=True)]
-            return [x if i in perturbation.passing else x + perturbation.base[i] * still
-                    for i, x in enumerate(found)]  # fmt: skip
+            return [
+                x if i in perturbation.passing else x + perturbation.base[i] * still
+                for i, x in enumerate(found)
+            ]
 
         def part(tasks, i):
             share = i / parts
@@ -144,10 +170,16 @@ class GridTerm(dfx.AbstractTerm):
 
         return jax.lax.scan(part, tasks, jnp.arange(parts, dtype=begun.dtype))[0], after
 
-    def _heun(self, task: AbstractTask, y: tuple, at: Array, u: list, later: list, kicks: list) -> tuple[Array, ...]:
+    def _heun(
+        self, task: AbstractTask, y: tuple, at: Array, u: list, later: list, kicks: list
+    ) -> tuple[Array, ...]:
         size = self.grid.dt / self.grid.substeps
         nothing = jnp.zeros_like(y[0])
-        dW = None if all(kick is None for kick in kicks) else jnp.stack([nothing if k is None else k for k in kicks])
+        dW = (
+            None
+            if all(kick is None for kick in kicks)
+            else jnp.stack([nothing if k is None else k for k in kicks])
+        )
 
         def change(t, y, u):
             field = lambda u: task.vector_field(t * self.grid.dt, jnp.stack(y), u)  # noqa: E731
@@ -157,7 +189,9 @@ class GridTerm(dfx.AbstractTerm):
             return [size * a + b for a, b in zip(drift, diffusion, strict=True)]
 
         first = change(at, y, u)
-        second = change(at + 1 / self.grid.substeps, [a + b for a, b in zip(y, first, strict=True)], later)
+        second = change(
+            at + 1 / self.grid.substeps, [a + b for a, b in zip(y, first, strict=True)], later
+        )
         return tuple(a + 0.5 * (b + c) for a, b, c in zip(y, first, second, strict=True))
 
     @eqx.filter_jit
@@ -170,39 +204,57 @@ class GridTerm(dfx.AbstractTerm):
         wave, slope = jax.jvp(self.tasks[0].harmonic, (t,), (jnp.ones_like(t),))
         u = jnp.stack(perturbation.inputs(y.perturbation, wave))
         du = jnp.stack(perturbation.slopes(y.perturbation, slope))
-        return tuple(task.output(t, jnp.stack(state), u, du) for task, state in zip(self.tasks, y.tasks, strict=True))
+        return tuple(
+            task.output(t, jnp.stack(state), u, du)
+            for task, state in zip(self.tasks, y.tasks, strict=True)
+        )
 
 
 def tabulated(task: AbstractTask, grid: Grid) -> AbstractTask:
     """The task with its harmonic and inputs looked up on the grid of sub-steps.
 
-    They are the same for every seed, but inside the loop they would be computed for each state of each seed. Not for the
-    reverse mode, which would carry a gradient of the whole table through every step.
+    They are the same for every seed, but inside the loop they would be computed for each state of
+    each seed. Not for the reverse mode, which would carry a gradient of the whole table through
+    every step.
     """
     if grid.reverse:
         return task
     interval, points = grid.dt / grid.substeps, grid.steps * grid.substeps + 1
-    names = [f.name for f in dataclasses.fields(task) if isinstance(getattr(task, f.name), AbstractSignal)]
+    names = [
+        f.name
+        for f in dataclasses.fields(task)
+        if isinstance(getattr(task, f.name), AbstractSignal)
+    ]
     names = [name for name in names if not isinstance(getattr(task, name), Constant)]
-    parts = [Tabulated.of(signal, interval, points) for signal in (*(getattr(task, n) for n in names), task.harmonic)]
+    parts = [
+        Tabulated.of(signal, interval, points)
+        for signal in (*(getattr(task, n) for n in names), task.harmonic)
+    ]
     return eqx.tree_at(lambda t: [*(getattr(t, n) for n in names), t.harmonic], task, parts)
 
 
 class Response(NamedTuple):
-    """Of noise paths: the first task's states at the samples (None if not asked for), and every task's output."""
+    """Of noise paths: the first task's states at the samples (None if not asked for), and every
+    task's output."""
 
     states: Float[Array, "seeds samples states"] | None
     outputs: tuple[Float[Array, "seeds samples"], ...]
 
 
 def integrated(
-    tasks: tuple[AbstractTask, ...], sources: Stream | Realisation, grid: Grid, sampling: str, *, states: bool,
+    tasks: tuple[AbstractTask, ...],
+    sources: Stream | Realisation,
+    grid: Grid,
+    sampling: str,
+    *,
+    states: bool,
     loud: Float[Array, " seeds"] | None = None,
-) -> Response:  # fmt: skip
-    """Tasks that share a perturbation (a task and its linearisation), on the seeds' random numbers or on given unit paths.
+) -> Response:
+    """Tasks that share a perturbation (a task and its linearisation), on the seeds' random numbers
+    or on given unit paths.
 
-    `sources` have a leading axis of seeds; `loud` multiplies the noise of each. What overflows is not finite, never an
-    exception.
+    `sources` have a leading axis of seeds; `loud` multiplies the noise of each. What overflows is
+    not finite, never an exception.
     """
     instants = sampling == "instant"
     looked_up = (tabulated(tasks[0], grid), *tasks[1:])
@@ -227,17 +279,24 @@ def integrated(
         adjoint=dfx.DirectAdjoint() if grid.reverse else dfx.ForwardMode(),
         throw=False,
     )
-    found = jax.tree.map(lambda rows: jnp.moveaxis(rows[: grid.steps // grid.every + 1], 0, 1), solution.ys)
+    found = jax.tree.map(
+        lambda rows: jnp.moveaxis(rows[: grid.steps // grid.every + 1], 0, 1), solution.ys
+    )
     seen, path = found["seen"], jnp.stack(found["states"], axis=2) if states else None
     if instants:
         return Response(path, seen)
     started = term.outputs(begun, jnp.zeros((), begun.tasks[0][0].dtype))
     sampled = jax.vmap(lambda start, rows: _sampled(start, rows[1:], grid, sampling))
-    return Response(path, tuple(sampled(one, rows) for one, rows in zip(started, seen, strict=True)))
+    return Response(
+        path, tuple(sampled(one, rows) for one, rows in zip(started, seen, strict=True))
+    )
 
 
-def _sampled(start: Array, seen: Float[Array, "intervals every"], grid: Grid, sampling: str) -> Float[Array, " samples"]:
-    """Samples of the output at all grid points: their mean over each sampling interval, or low-passed."""
+def _sampled(
+    start: Array, seen: Float[Array, "intervals every"], grid: Grid, sampling: str
+) -> Float[Array, " samples"]:
+    """Samples of the output at all grid points: their mean over each sampling interval, or
+    low-passed."""
     fine = jnp.concatenate([start[None], seen.ravel()])
     if sampling == "filtered":
         return decimated(fine, grid.every)

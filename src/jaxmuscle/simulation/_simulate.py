@@ -44,56 +44,72 @@ def simulate(
     substeps: int | None = None,
     sampling: str | None = None,
 ) -> Trajectory:
-    """Simulate one seed of the task's equation y' = f(t, y, u), in which noise and harmonic are part of u.
+    """Simulate one seed of the task's equation y' = f(t, y, u), in which noise and harmonic are
+    part of u.
 
         run = jm.simulate(jm.Isometric(k_w=4e5), jax.random.key(0), seed=3)
         run.plot()
 
-    y is the state, u the perturbation (docs/model.md, *Where noise enters*). Coloured noise has a value in u at every
-    instant. White noise adds `(∂f/∂u) σ ∘ dW`, in the sense of Stratonovich: W are standard Wiener processes, and σ is
-    the noise's amplitude, in the unit of its coefficient, over the root of the `rate` of the noise.
+    y is the state, u the perturbation (docs/model.md, *Where noise enters*). Coloured noise has a
+    value in u at every instant. White noise adds `(∂f/∂u) σ ∘ dW`, in the sense of Stratonovich: W
+    are standard Wiener processes, and σ is the noise's amplitude, in the unit of its coefficient,
+    over the root of the `rate` of the noise.
 
-    Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's parameters, of which
-    `output` is a function. `duration`, `dt`, `rate`, `substeps` and `sampling` are static: they decide the shape of the
-    program.
+    Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's
+    parameters, of which `output` is a function. `duration`, `dt`, `rate`, `substeps` and `sampling`
+    are static: they decide the shape of the program.
 
     **Arguments:**
 
     - `task`: what is simulated, as `jaxmuscle.Isometric()`
-    - `key`: a `jax.random` key, or a whole number n for `jax.random.key(n)`; seed i draws from `fold_in(key, i)`
+    - `key`: a `jax.random` key, or a whole number n for `jax.random.key(n)`; seed i draws from
+      `fold_in(key, i)`
     - `seed`: number of the noise path; for several use `ensemble`, or `jax.vmap`
     - `duration` [s]
     - `dt` [s]: the grid on which noise is drawn, which must divide the sampling interval
     - `rate` [Hz] of the samples returned, the task's spectrum settings by default
-    - `substeps` per dt: by default as many as stability asks for, a power of two, so that max |eigenvalue| dt / substeps <=
-      0.5. That number hangs on the parameters. Where JAX traces them (jit, grad, vmap of the task) it cannot be known, and
-      one is taken: a stiff or strongly damped muscle then gives nan. Give the number that `simulate(task, key).substeps` has
-      for the stiffest values that you will try
-    - `sampling`: as in `SpectrumSettings` (the task's by default): "filtered" needs two steps of dt or more per sample, and
-      the first and last 10 samples feel the ends; at a higher rate than that of the settings "instant" takes its place, as
-      the spectrum is then low-passed when it is made
+    - `substeps` per dt: by default as many as stability asks for, a power of two, so that max
+      |eigenvalue| dt / substeps <= 0.5. That number hangs on the parameters. Where JAX traces them
+      (jit, grad, vmap of the task) it cannot be known, and one is taken: a stiff or strongly damped
+      muscle then gives nan. Give the number that `simulate(task, key).substeps` has for the
+      stiffest values that you will try
+    - `sampling`: as in `SpectrumSettings` (the task's by default): "filtered" needs two steps of dt
+      or more per sample, and the first and last 10 samples feel the ends; at a higher rate than
+      that of the settings "instant" takes its place, as the spectrum is then low-passed when it is
+      made
 
     **Returns:** a `Trajectory`: its `output` at its `time` [s], the `states`.
 
-    **Raises:** `ValueError` for a grid that does not fit, `SimulationError` if the result is not finite (not under a JAX
-    transformation, where it is returned as it is).
+    **Raises:** `ValueError` for a grid that does not fit, `SimulationError` if the result is not
+    finite (not under a JAX transformation, where it is returned as it is).
     """
     require_task(task, "simulate(task, key)")
     if np.ndim(seed) > 0:
-        raise ValueError(f"seed = {seed!r}: one simulation has one seed. For several use jaxmuscle.ensemble(task, key, "
-                         "seeds=...), or jax.vmap over seed")  # fmt: skip
-    seeds = jnp.asarray([seed_of(seed)], jnp.uint32) if all_concrete(seed) else jnp.atleast_1d(jnp.asarray(seed))
-    result = trajectories(task, None, key_of(key), seeds, schedule(task, duration, dt, rate, substeps, sampling))[0]
+        raise ValueError(
+            f"seed = {seed!r}: one simulation has one seed. For several use"
+            " jaxmuscle.ensemble(task, key, seeds=...), or jax.vmap over seed"
+        )
+    seeds = (
+        jnp.asarray([seed_of(seed)], jnp.uint32)
+        if all_concrete(seed)
+        else jnp.atleast_1d(jnp.asarray(seed))
+    )
+    result = trajectories(
+        task, None, key_of(key), seeds, schedule(task, duration, dt, rate, substeps, sampling)
+    )[0]
     require_finite(result)
     return result
 
 
 def companion(task: AbstractTask, duration: float, *, required: bool) -> LinearTask | None:
-    """The linearised task, if its response is stationary in the analysed window; else None, or an error if required."""
+    """The linearised task, if its response is stationary in the analysed window; else None, or an
+    error if required."""
     with jax.enable_x64(True):
         linear = linearised(task)
         try:
-            slowest = check_equilibrium(task, np.asarray(linear.system.point), np.asarray(linear.system.A))
+            slowest = check_equilibrium(
+                task, np.asarray(linear.system.point), np.asarray(linear.system.A)
+            )
             check_inputs(task)
         except OperatingPointError:
             if required:
@@ -105,8 +121,9 @@ def companion(task: AbstractTask, duration: float, *, required: bool) -> LinearT
     if duration < WINDOW[1] or left > TRANSIENT:
         if required:
             raise ValueError(
-                f"control = True: duration = {duration} s must reach {WINDOW[1]} s, and by {WINDOW[0]} s the slowest motion "
-                f"must have decayed to {TRANSIENT:g} of its start, but {left:.2g} is left: simulate settled(task)"
+                f"control = True: duration = {duration} s must reach {WINDOW[1]} s, and by"
+                f" {WINDOW[0]} s the slowest motion must have decayed to {TRANSIENT:g} of its"
+                f" start, but {left:.2g} is left: simulate settled(task)"
             )
         return None
     return linear
@@ -136,14 +153,20 @@ def schedule(
     """The plan of a simulation. Raises `ValueError` for a grid that does not fit."""
     own = task.settings
     if sampling is None:  # a finer run is low-passed when its spectrum is made
-        sampling = "instant" if own.sampling == "filtered" and rate is not None and rate > own.rate else own.sampling
+        sampling = (
+            "instant"
+            if own.sampling == "filtered" and rate is not None and rate > own.rate
+            else own.sampling
+        )
     rate = own.rate if rate is None else rate
     if sampling not in get_args(Sampling):
         raise ValueError(f"sampling = {sampling!r} must be one of {', '.join(get_args(Sampling))}")
     for name, value in (("dt", dt), ("rate", rate), ("duration", duration), ("substeps", substeps)):
         if not is_concrete(value):
-            raise ValueError(f"{name} is traced by JAX, and decides how many steps there are: close over it, or make it one "
-                             "of the static_argnames of jax.jit")  # fmt: skip
+            raise ValueError(
+                f"{name} is traced by JAX, and decides how many steps there are: close over it, or"
+                " make it one of the static_argnames of jax.jit"
+            )
         if name != "substeps":
             positive(name, value)
     if substeps is not None:
@@ -152,44 +175,60 @@ def schedule(
         task.check_step(dt)
     every = steps_per_sample(rate, dt, sampling)
     samples = whole(
-        float(duration) * rate, f"duration = {duration} s is not a whole number of sampling intervals {1 / rate} s"
+        float(duration) * rate,
+        f"duration = {duration} s is not a whole number of sampling intervals {1 / rate} s",
     )
     if samples * every > MOST_STEPS:
-        raise ValueError(f"duration = {duration} s at dt = {dt} s makes {samples * every} steps, at most {MOST_STEPS} are "
-                         "possible: give a shorter duration or a larger dt")  # fmt: skip
+        raise ValueError(
+            f"duration = {duration} s at dt = {dt} s makes {samples * every} steps, at most"
+            f" {MOST_STEPS} are possible: give a shorter duration or a larger dt"
+        )
     if substeps is None:
         substeps = stable_substeps(task, dt, duration) if all_concrete(task) else 1
-    return Schedule(Grid(dt, samples * every, every, substeps, reverse=not all_concrete(task)), sampling, rate)
+    return Schedule(
+        Grid(dt, samples * every, every, substeps, reverse=not all_concrete(task)), sampling, rate
+    )
 
 
 def steps_per_sample(rate: float, dt: float, sampling: str) -> int:
-    """Steps of dt in a sampling interval. Raises `ValueError` if dt does not divide it, or leaves nothing to be filtered."""
+    """Steps of dt in a sampling interval. Raises `ValueError` if dt does not divide it, or leaves
+    nothing to be filtered."""
     least = max(math.ceil(1 / (rate * dt)), 1 + (sampling == "filtered"))
-    finer = sorted({least, *(n for n in (2, 4, 5, 10, 20, 50, 100) if n > least)})  # a larger dt may not do for the noise
+    # a larger dt may not do for the noise
+    finer = sorted({least, *(n for n in (2, 4, 5, 10, 20, 50, 100) if n > least)})
     choices = f"{', '.join(f'{1 / rate / n:.9g}' for n in finer[:4])} s"
     apart = f"the sampling interval {1 / rate:.9g} s"
     every = whole(1 / (rate * dt), f"dt = {dt} s does not divide {apart}: use one of {choices}")
     if every == 1 and sampling == "filtered":
-        raise ValueError(f"dt = {dt} s is a whole sampling interval, but sampling = 'filtered' needs points between the "
-                         f"samples: use half of it or less, or sampling = 'instant'")  # fmt: skip
+        raise ValueError(
+            f"dt = {dt} s is a whole sampling interval, but sampling = 'filtered' needs points"
+            " between the samples: use half of it or less, or sampling = 'instant'"
+        )
     return every
 
 
 def whole(value: float, message: str) -> int:
-    """A number that must be whole (up to rounding) and positive, else a `ValueError` with the message."""
-    if not math.isfinite(value) or round(value) < 1 or abs(value - round(value)) > 1e-6 * max(1.0, value):
+    """A number that must be whole (up to rounding) and positive, else a `ValueError` with the
+    message."""
+    if (
+        not math.isfinite(value)
+        or round(value) < 1
+        or abs(value - round(value)) > 1e-6 * max(1.0, value)
+    ):
         raise ValueError(message)
     return round(value)
 
 
 def stable_substeps(task: AbstractTask, dt: float, duration: float = DURATION) -> int:
-    """The power of two of sub-steps that brings max |eigenvalue| dt to at most 0.5; Heun diverges above 2."""
+    """The power of two of sub-steps that brings max |eigenvalue| dt to at most 0.5; Heun diverges
+    above 2."""
     fastest = fastest_rate(task, duration)
     substeps = parts_for(fastest, dt, MAX_RATE_STEP)
     if substeps > MAX_SUBSTEPS:
         raise ValueError(
-            f"this task has an eigenvalue of {fastest:.3g}/s, which asks for {substeps} sub-steps of dt = {dt} s "
-            f"(at most {MAX_SUBSTEPS}): use heavier masses, less damping or a smaller dt"
+            f"this task has an eigenvalue of {fastest:.3g}/s, which asks for {substeps} sub-steps"
+            f" of dt = {dt} s (at most {MAX_SUBSTEPS}): use heavier masses, less damping or a"
+            " smaller dt"
         )
     return substeps
 
@@ -203,27 +242,43 @@ def trajectories(
     mesh: Any = None,
     draws: Draws = Draws(),  # noqa: B008
 ) -> Trajectory:
-    """Every seed of one task in one program, finite or not; arrays stay where they were computed."""
+    """Every seed of one task in one program, finite or not; arrays stay where they were
+    computed."""
     recipe = Recipe(plan.grid, plan.sampling, True, SpectrumSettings(), draws=draws)
-    found = run_seeds(mechanics(task), None if linear is None else mechanics(linear), key, seeds, recipe, mesh)
+    found = run_seeds(
+        mechanics(task), None if linear is None else mechanics(linear), key, seeds, recipe, mesh
+    )
     grid = plan.grid
-    return Trajectory(task, found["states"], found["output"], seeds, plan.rate, grid.dt, grid.substeps, plan.sampling,
-                      found["linear"])  # fmt: skip
+    return Trajectory(
+        task,
+        found["states"],
+        found["output"],
+        seeds,
+        plan.rate,
+        grid.dt,
+        grid.substeps,
+        plan.sampling,
+        found["linear"],
+    )
 
 
 def require_finite(found: Trajectory, where: str = "") -> None:
-    """Raises `SimulationError` for seeds that did not stay finite, as far as the values are known."""
+    """Raises `SimulationError` for seeds that did not stay finite, as far as the values are
+    known."""
     if not all_concrete(found.output):
         return
     bad = np.atleast_1d(found.seeds)[~np.atleast_1d(np.asarray(found.finite))]
     if bad.size:
         raise SimulationError(
-            f"{len(bad)} seed(s) did not stay finite ({listed(bad)}) in {type(found.task).__name__}{where} at dt = "
-            f"{found.dt} s, {found.substeps} sub-step(s): lower dt or the noise amplitude, or leave substeps out. "
-            f"Parameters: {told(found.task)}"
+            f"{len(bad)} seed(s) did not stay finite ({listed(bad)}) in"
+            f" {type(found.task).__name__}{where} at dt = {found.dt} s, {found.substeps}"
+            " sub-step(s): lower dt or the noise amplitude, or leave substeps out. Parameters:"
+            f" {told(found.task)}"
         )
 
 
 def told(task: AbstractTask) -> str:
     """Parameters with their values."""
-    return ", ".join(f"{name} = {float(value):.6g}" for name, value in as_numbers(task.parameters).items())
+    return ", ".join(
+        f"{name} = {float(value):.6g}" for name, value in as_numbers(task.parameters).items()
+    )

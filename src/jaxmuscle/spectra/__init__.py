@@ -1,4 +1,5 @@
-"""Power spectra as experiments estimate them (Welch), the sampling law of their bins, and measures of variability.
+"""Power spectra as experiments estimate them (Welch), the sampling law of their bins, and measures
+of variability.
 
 It takes arrays and settings; it knows no muscle and no target.
 """

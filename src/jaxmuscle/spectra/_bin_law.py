@@ -19,24 +19,29 @@ NORMAL = 1.96  # standard errors to either side that hold 95 %
 
 
 class BinLaw(NamedTuple):
-    """Sampling law of Welch powers: equivalent degrees of freedom ν of every bin, and the correlation of bins."""
+    """Sampling law of Welch powers: equivalent degrees of freedom ν of every bin, and the
+    correlation of bins."""
 
     degrees: Float[np.ndarray, " bins"]
     correlation: Float[np.ndarray, "bins bins"]
 
 
 def welch_law(settings: SpectrumSettings, bins: np.ndarray, segments: tuple[int, ...]) -> BinLaw:
-    """Law of Welch powers for a density that is flat within a segment's resolution, detrending and both signs of f included.
+    """Law of Welch powers for a density that is flat within a segment's resolution, detrending and
+    both signs of f included.
 
-    `Cov(S_k, S_l) = Σ_j (1 - |j|/K)/K Σ_tu (|E X_kt X_lu*|² + |E X_kt X_lu|²)` over segments j apart and tapers t, u, X the
-    tapered, detrended transform; ν_k = 2 E_k² / Var_k. Trials are averaged with weights proportional to their segments.
-    Removing the mean and leakage from negative frequencies cost bin 1 a fifth of its degrees of freedom.
+    `Cov(S_k, S_l) = Σ_j (1 - |j|/K)/K Σ_tu (|E X_kt X_lu*|² + |E X_kt X_lu|²)` over segments j
+    apart and tapers t, u, X the tapered, detrended transform; ν_k = 2 E_k² / Var_k. Trials are
+    averaged with weights proportional to their segments. Removing the mean and leakage from
+    negative frequencies cost bin 1 a fifth of its degrees of freedom.
     """
     return _welch_law(settings, tuple(int(k) for k in bins), tuple(segments))
 
 
 @functools.lru_cache(maxsize=256)
-def _welch_law(settings: SpectrumSettings, bins: tuple[int, ...], segments: tuple[int, ...]) -> BinLaw:
+def _welch_law(
+    settings: SpectrumSettings, bins: tuple[int, ...], segments: tuple[int, ...]
+) -> BinLaw:
     rows = bin_rows(settings)[np.asarray(bins) - settings.first_bin]
     n, step, shape = settings.length, settings.step, rows.shape[:2]
     power = np.sum(np.abs(rows) ** 2, axis=(1, 2))
@@ -44,33 +49,46 @@ def _welch_law(settings: SpectrumSettings, bins: tuple[int, ...], segments: tupl
     for count, trials in Counter(segments).items():
         reach = min(count - 1, (n - 1) // step)
         for j in range(-reach, reach + 1):
-            near, far = (rows[:, abs(j) * step :], rows[:, : n - abs(j) * step])[:: 1 if j >= 0 else -1]
-            both = (np.abs(near @ far.conj().T) ** 2 + np.abs(near @ far.T) ** 2).reshape(shape * 2).sum(axis=(1, 3))
+            near, far = (rows[:, abs(j) * step :], rows[:, : n - abs(j) * step])[
+                :: 1 if j >= 0 else -1
+            ]
+            both = (
+                (np.abs(near @ far.conj().T) ** 2 + np.abs(near @ far.T) ** 2)
+                .reshape(shape * 2)
+                .sum(axis=(1, 3))
+            )
             covariance += trials * count * (1 - abs(j) / count) / sum(segments) ** 2 * both
     sd = np.sqrt(np.diag(covariance))
     return BinLaw(2 * power**2 / sd**2, covariance / np.outer(sd, sd))
 
 
 def target_law(target: Any) -> BinLaw:
-    """`welch_law` of a target's bins; where its trials scatter more than their segments explain, with fewer degrees."""
+    """`welch_law` of a target's bins; where its trials scatter more than their segments explain,
+    with fewer degrees."""
     law = welch_law(target.settings, target.bins, target.segments)
     return law._replace(degrees=law.degrees / target.overdispersion**2)
 
 
 def dispersion_of(
-    power: Float[np.ndarray, "trials bins"], segments: tuple[int, ...], settings: SpectrumSettings, bins: np.ndarray
+    power: Float[np.ndarray, "trials bins"],
+    segments: tuple[int, ...],
+    settings: SpectrumSettings,
+    bins: np.ndarray,
 ) -> tuple[float, float]:
-    """How many times more the mean of several trials' spectra scatters than their segments explain, and its standard error.
+    """How many times more the mean of several trials' spectra scatters than their segments explain,
+    and its standard error.
 
-    The mean S is weighted with the segments K_i, so that trial i, whose power is a_i times the mean's, has the share
-    `s_i = K_i a_i / Σ K a` in it. Two things make S scatter more than `welch_law` says:
+    The mean S is weighted with the segments K_i, so that trial i, whose power is a_i times the
+    mean's, has the share `s_i = K_i a_i / Σ K a` in it. Two things make S scatter more than
+    `welch_law` says:
 
         d² = Σ_i s_i² |D⁻¹ C r_i|² / Σ_i E_i  ·  ΣK Σ_i s_i² / K_i,      r_ik = P_ik / (a_i S_k) - 1
 
-    The second factor is that of unequal power, since the strongest trials outweigh the others. The first is how the shapes
-    differ: V is the law's covariance of the log powers of S, D its standard deviations, C = 1 - 1/n takes out what all bins
-    have in common, and `E_i = ΣK s_i² ((1 - 2 s_i) / K_i + Σ_j s_j² / K_j) tr A`, A = D⁻¹ C V C D⁻¹, is what it expects.
-    The standard error is the larger of the law's own and that by the scatter of the trials' contributions.
+    The second factor is that of unequal power, since the strongest trials outweigh the others. The
+    first is how the shapes differ: V is the law's covariance of the log powers of S, D its standard
+    deviations, C = 1 - 1/n takes out what all bins have in common, and `E_i = ΣK s_i² ((1 - 2 s_i)
+    / K_i + Σ_j s_j² / K_j) tr A`, A = D⁻¹ C V C D⁻¹, is what it expects. The standard error is the
+    larger of the law's own and that by the scatter of the trials' contributions.
     """
     law = welch_law(settings, bins, segments)
     sd, counts = np.sqrt(2 / law.degrees), np.asarray(segments)
@@ -82,7 +100,9 @@ def dispersion_of(
     each = s**2 * np.sum(((ratio / size[:, None] - 1) @ centre.T) ** 2, axis=1)
     if not np.any(each > 0):  # the same trial twice
         return 0.0, 0.0
-    expected = counts.sum() * np.trace(a) * np.sum(s**2 * ((1 - 2 * s) / counts + np.sum(s**2 / counts)))
+    expected = (
+        counts.sum() * np.trace(a) * np.sum(s**2 * ((1 - 2 * s) / counts + np.sum(s**2 / counts)))
+    )
     value = np.sqrt(np.sum(each) / expected * counts.sum() * np.sum(s**2 / counts))
     effective = max(1 / np.sum(s**2) - 1, 0.5)
     by_law = np.sqrt(2 * np.sum(a**2) / effective) / np.trace(a)
@@ -91,15 +111,18 @@ def dispersion_of(
 
 
 def student(count: int) -> float:
-    """How many standard errors, by the scatter of so many values, to either side of their mean hold 95 % (Student's t)."""
+    """How many standard errors, by the scatter of so many values, to either side of their mean hold
+    95 % (Student's t)."""
     return float(stdtrit(count - 1, 0.975))
 
 
 def mean_error(values: Float[np.ndarray, " trials"], expected: Any) -> Any:
-    """The error of a mean over trials: the `expected` one, or that by their scatter where this is larger.
+    """The error of a mean over trials: the `expected` one, or that by their scatter where this is
+    larger.
 
-    The scatter of a few values is uncertain itself. So of three trials or more it is multiplied by t / 1.96, with Student's
-    t: then ± 1.96 of it hold 95 %. Of two it would be 6.5 times as much, so that the mean told nothing.
+    The scatter of a few values is uncertain itself. So of three trials or more it is multiplied by
+    t / 1.96, with Student's t: then ± 1.96 of it hold 95 %. Of two it would be 6.5 times as much,
+    so that the mean told nothing.
     """
     count = len(values)
     if count < 2:
@@ -110,10 +133,11 @@ def mean_error(values: Float[np.ndarray, " trials"], expected: Any) -> Any:
 
 
 class BinStatistics(NamedTuple):
-    """Sampling law of a target's log powers: expected offset `bias`, standard deviation `sd`, `correlation` of bins.
+    """Sampling law of a target's log powers: expected offset `bias`, standard deviation `sd`,
+    `correlation` of bins.
 
-    `half` is half the degrees of freedom of every bin, NaN where no segments are stated. All but `correlation` have leading
-    axes where the line's share had.
+    `half` is half the degrees of freedom of every bin, NaN where no segments are stated. All but
+    `correlation` have leading axes where the line's share had.
     """
 
     bias: Float[np.ndarray, "*rows bins"]
@@ -129,15 +153,20 @@ class BinStatistics(NamedTuple):
 
 
 def log_power_moments(degrees_of_freedom: Any) -> tuple[Any, Any]:
-    """Bias `ψ(ν/2) - ln(ν/2)` and variance `ψ'(ν/2)` of the log of a chi-squared estimate with ν degrees of freedom."""
+    """Bias `ψ(ν/2) - ln(ν/2)` and variance `ψ'(ν/2)` of the log of a chi-squared estimate with ν
+    degrees of freedom."""
     half = np.asarray(degrees_of_freedom) / 2
     return digamma(half) - np.log(half), polygamma(1, half)
 
 
-def bin_statistics(target: Any, line_share: Float[np.ndarray, "*rows bins"] | None = None) -> BinStatistics:
-    """Statistics of a target's log powers: from its segments by `welch_law`, else from its sigma, else unknown (sd 1).
+def bin_statistics(
+    target: Any, line_share: Float[np.ndarray, "*rows bins"] | None = None
+) -> BinStatistics:
+    """Statistics of a target's log powers: from its segments by `welch_law`, else from its sigma,
+    else unknown (sd 1).
 
-    A harmonic line that holds the share ρ of a bin does not scatter: it has 1 / (1 - ρ²) times the degrees of freedom.
+    A harmonic line that holds the share ρ of a bin does not scatter: it has 1 / (1 - ρ²) times the
+    degrees of freedom.
     """
     n = len(target.bins)
     share = np.zeros(n) if line_share is None else np.asarray(line_share)
@@ -149,24 +178,30 @@ def bin_statistics(target: Any, line_share: Float[np.ndarray, "*rows bins"] | No
         return BinStatistics(bias, np.sqrt(variance), law.correlation, degrees / 2, True)
     if target.sigma is not None:
         sd = np.sqrt(np.log1p((target.sigma / target.proportional_power) ** 2))
-        return BinStatistics(np.zeros(share.shape), np.broadcast_to(sd, share.shape), np.eye(n), unknown, True)
+        return BinStatistics(
+            np.zeros(share.shape), np.broadcast_to(sd, share.shape), np.eye(n), unknown, True
+        )
     return BinStatistics(np.zeros(share.shape), np.ones(share.shape), np.eye(n), unknown, n == 0)
 
 
 def samples_of(segments: int, settings: SpectrumSettings) -> int:
-    """Samples of a recording with so many Welch segments: half a step more than these take, on the average."""
+    """Samples of a recording with so many Welch segments: half a step more than these take, on the
+    average."""
     return min(settings.length - settings.step // 2 + segments * settings.step, LONGEST)
 
 
 def trial_samples(target: Any) -> int:
-    """Samples of a trial of a target, the average of several; of 10 s where it states no segments."""
+    """Samples of a trial of a target, the average of several; of 10 s where it states no
+    segments."""
     if target.segments is None:
         return samples_in(WINDOW, target.settings)
     return round(np.mean([samples_of(k, target.settings) for k in target.segments]))
 
 
 def standardised(
-    target_power: Float[np.ndarray, " bins"], fitted: Float[np.ndarray, " bins"], statistics: BinStatistics
+    target_power: Float[np.ndarray, " bins"],
+    fitted: Float[np.ndarray, " bins"],
+    statistics: BinStatistics,
 ) -> Float[np.ndarray, " bins"]:
     """`(z_k - z̄) / sd_k` with `z_k = ln(target_k / fitted_k) - bias_k`."""
     z = np.log(target_power) - np.log(fitted) - statistics.bias
@@ -188,7 +223,8 @@ def sides_of(settings: SpectrumSettings) -> Float[np.ndarray, " bins"]:
 
 @functools.cache
 def bin_rows(settings: SpectrumSettings) -> Complex[np.ndarray, "bins tapers length"]:
-    """Detrending, tapers and transform of a segment as one matrix: X_kt = Σ_m a_ktm x_m, so that power is Σ_t |X_kt|²."""
+    """Detrending, tapers and transform of a segment as one matrix: X_kt = Σ_m a_ktm x_m, so that
+    power is Σ_t |X_kt|²."""
     n, m = settings.length, np.arange(settings.length)
     k = np.arange(settings.first_bin, settings.last_bin + 1)
     turns = np.exp(-2j * np.pi * np.outer(k, m) / n) * np.sqrt(sides_of(settings))[:, None]

@@ -15,10 +15,10 @@ FEWEST = 3  # segments times tapers
 class Response(NamedTuple):
     """The response H of an output to an input in the bins that the input excites.
 
-    `input_power` is the input's density, `stderr` the standard error of the real and of the imaginary part of `value`,
-    `correlation` that of the errors of bins, `E e_k e_l* / √(E|e_k|² E|e_l|²)`. `centre` is where the input that a bin sees
-    lies on the average [Hz]: at an edge of the input's band not in the middle of the bin, and to first order `value` is H
-    at the centre.
+    `input_power` is the input's density, `stderr` the standard error of the real and of the
+    imaginary part of `value`, `correlation` that of the errors of bins, `E e_k e_l* / √(E|e_k|²
+    E|e_l|²)`. `centre` is where the input that a bin sees lies on the average [Hz]: at an edge of
+    the input's band not in the middle of the bin, and to first order `value` is H at the centre.
     """
 
     frequency: Float[np.ndarray, " bins"]
@@ -33,14 +33,16 @@ class Response(NamedTuple):
 def ordinates(
     signal: Float[np.ndarray, " times"], settings: SpectrumSettings
 ) -> Complex[np.ndarray, "segments bins tapers"]:
-    """The transforms of all segments, detrended and tapered; the mean of their squares, added over tapers, is the density.
+    """The transforms of all segments, detrended and tapered; the mean of their squares, added over
+    tapers, is the density.
 
     **Raises:** `ValueError` if the signal holds fewer than three, tapers counted.
     """
     count, rows, n = settings.segments(signal.size), bin_rows(settings), settings.length
     needed = n + (-(-FEWEST // settings.tapers) - 1) * settings.step
     remedy = (
-        f"a frequency response needs {needed} at {settings.rate:g} Hz, {needed / settings.rate:g} s; give a longer window"
+        f"a frequency response needs {needed} at {settings.rate:g} Hz, {needed / settings.rate:g}"
+        " s; give a longer window"
     )
     require(count * settings.tapers >= FEWEST, "samples", signal.size, remedy)
     pieces = signal[settings.step * np.arange(count)[:, None] + np.arange(n)]
@@ -48,17 +50,22 @@ def ordinates(
 
 
 def response_of(
-    given: Float[np.ndarray, " times"], output: Float[np.ndarray, " times"], settings: SpectrumSettings
+    given: Float[np.ndarray, " times"],
+    output: Float[np.ndarray, " times"],
+    settings: SpectrumSettings,
 ) -> Response:
-    """The least-squares response `H_k = Σ X* Y / Σ |X|²` over segments and tapers, with the errors that noise in Y leaves.
+    """The least-squares response `H_k = Σ X* Y / Σ |X|²` over segments and tapers, with the errors
+    that noise in Y leaves.
 
-    Given the input, the error of H_k is `Σ X* N / Σ |X|²`. The ordinates N of the noise are correlated by what segments,
-    tapers and bins share, `E N_a N_b* = S g_ab` for a density S that is flat across a bin. So
+    Given the input, the error of H_k is `Σ X* N / Σ |X|²`. The ordinates N of the noise are
+    correlated by what segments, tapers and bins share, `E N_a N_b* = S g_ab` for a density S that
+    is flat across a bin. So
 
         Cov(H_k, H_l) = √(S_k S_l) v_kl,   v_kl = Σ_ab X*_ak X_bl g_ab,kl / (Σ|X_k|² Σ|X_l|²),
 
-    exactly for any input, periodic or random. S_k is the residual `Σ |Y - H X|²` over its expectation
-    `Σ g_aa - v_kk Σ|X_k|²`. Bins with less than 1e-4 of the input's largest density are left out.
+    exactly for any input, periodic or random. S_k is the residual `Σ |Y - H X|²` over its
+    expectation `Σ g_aa - v_kk Σ|X_k|²`. Bins with less than 1e-4 of the input's largest density are
+    left out.
     """
     x, y = ordinates(given, settings), ordinates(output, settings)
     count, step, n = len(x), settings.step, settings.length
@@ -73,19 +80,34 @@ def response_of(
         v += part if j == 0 else part + part.conj().T
     v /= np.outer(power, power)
     cross, total = np.sum(x.conj() * y, axis=(0, 2)), np.sum(np.abs(y) ** 2, axis=(0, 2))
-    expected = count * np.sum(np.abs(rows) ** 2, axis=1).reshape(shape).sum(axis=1) - np.real(np.diag(v)) * power
+    expected = (
+        count * np.sum(np.abs(rows) ** 2, axis=1).reshape(shape).sum(axis=1)
+        - np.real(np.diag(v)) * power
+    )
     noise = np.maximum(total - np.abs(cross) ** 2 / power, 0.0) / expected
     sd = np.sqrt(np.real(np.diag(v)))
     return Response(
-        settings.frequency[kept], cross / power, sd * np.sqrt(noise / 2), np.abs(cross) ** 2 / (power * total),
-        v / np.outer(sd, sd), power / count, _centres(given, rows.reshape((*shape, n)), settings.rate),
-    )  # fmt: skip
+        settings.frequency[kept],
+        cross / power,
+        sd * np.sqrt(noise / 2),
+        np.abs(cross) ** 2 / (power * total),
+        v / np.outer(sd, sd),
+        power / count,
+        _centres(given, rows.reshape((*shape, n)), settings.rate),
+    )
 
 
 def _centres(
     given: Float[np.ndarray, " times"], rows: Complex[np.ndarray, "bins tapers n"], rate: float
 ) -> Float[np.ndarray, " bins"]:
-    """`Σ f |W_k(f)|² S(f) / Σ |W_k(f)|² S(f)`, S the input's periodogram, W_k the transform of a bin's rows."""
-    density, f = np.abs(np.fft.rfft(given - given.mean())) ** 2, np.fft.rfftfreq(given.size, 1 / rate)
-    seen = [np.sum(np.abs(np.fft.fft(row.conj(), given.size)[:, : f.size]) ** 2, axis=0) * density for row in rows]
+    """`Σ f |W_k(f)|² S(f) / Σ |W_k(f)|² S(f)`, S the input's periodogram, W_k the transform of a
+    bin's rows."""
+    density, f = (
+        np.abs(np.fft.rfft(given - given.mean())) ** 2,
+        np.fft.rfftfreq(given.size, 1 / rate),
+    )
+    seen = [
+        np.sum(np.abs(np.fft.fft(row.conj(), given.size)[:, : f.size]) ** 2, axis=0) * density
+        for row in rows
+    ]
     return np.array([share @ f / share.sum() for share in seen])

@@ -1,4 +1,5 @@
-"""The fluctuations of a record: their variance by frequency, in bands, and how they grow with the length of a window."""
+"""The fluctuations of a record: their variance by frequency, in bands, and how they grow with the
+length of a window."""
 
 import itertools
 from typing import Any
@@ -16,14 +17,17 @@ GROWTH, WINDOWS = 1.2, 10  # of one window over the last; how many of the larges
 
 
 def in_bands(frequency: Any, resolution: float) -> Any:
-    """How much of each bin lies in each band, from 0 to 1: a bin holds what is up to half the resolution away from it."""
+    """How much of each bin lies in each band, from 0 to 1: a bin holds what is up to half the
+    resolution away from it."""
     kind = np if isinstance(frequency, np.ndarray) else jnp
     edges = np.array(EDGES, frequency.dtype)[:, None]
     below = kind.clip((edges - frequency) / resolution + 0.5, 0.0, 1.0)
     return below[1:] - below[:-1]
 
 
-def one_record(signal: Real[Array | np.ndarray, "..."], fewest: int, words: str = "") -> Float[np.ndarray, " times"]:
+def one_record(
+    signal: Real[Array | np.ndarray, "..."], fewest: int, words: str = ""
+) -> Float[np.ndarray, " times"]:
     """A record, checked."""
     x = np.asarray(signal, dtype=float)
     remedy = f"give one record of at least {words}{fewest} samples"
@@ -36,18 +40,20 @@ def one_record(signal: Real[Array | np.ndarray, "..."], fewest: int, words: str 
 def variance_spectrum(
     signal: Real[Array | np.ndarray, "..."], rate: float
 ) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, " frequencies"]]:
-    """The variance of one record by frequency, without loss: P_k = X_k² / N, Σ_k P_k = σ². Not traceable.
+    """The variance of one record by frequency, without loss: P_k = X_k² / N, Σ_k P_k = σ². Not
+    traceable.
 
         frequency, variance = jm.spectra.variance_spectrum(np.sin(np.arange(1000.0)), 100.0)
 
-    X_k = √(2/N) Σ_m (x_m - μ) cos(πk(m + ½)/N), the cosine transform (DCT-II), for k = 1 to N - 1; its frequency is
-    k `rate` / 2N. The cosines continue the record as its mirror image, so that a drift makes no jump at the ends, which in
-    a plain periodogram spreads over all frequencies. For a stationary Gaussian record the P_k are nearly independent,
-    each with one degree of freedom.
+    X_k = √(2/N) Σ_m (x_m - μ) cos(πk(m + ½)/N), the cosine transform (DCT-II), for k = 1 to N - 1;
+    its frequency is k `rate` / 2N. The cosines continue the record as its mirror image, so that a
+    drift makes no jump at the ends, which in a plain periodogram spreads over all frequencies. For
+    a stationary Gaussian record the P_k are nearly independent, each with one degree of freedom.
 
     **Arguments:** `signal` (times,) [unit]; `rate`, samples per second [Hz].
 
-    **Returns:** frequency [Hz] and power [unit²], of which sums over bands are the power in these bands.
+    **Returns:** frequency [Hz] and power [unit²], of which sums over bands are the power in these
+    bands.
 
     **Raises:** `ValueError` if the signal is constant, not finite, or has fewer than 2 samples.
 
@@ -58,16 +64,20 @@ def variance_spectrum(
     return np.arange(1, x.size) * rate / (2 * x.size), power
 
 
-def dfa(signal: Real[Array | np.ndarray, "..."], smallest: int = 4, largest: int | None = None) -> float:
+def dfa(
+    signal: Real[Array | np.ndarray, "..."], smallest: int = 4, largest: int | None = None
+) -> float:
     """Exponent α of the detrended fluctuation analysis, F(n) ∝ n^α, of one record. Not traceable.
 
         jm.spectra.dfa(np.sin(np.arange(1000.0)))
 
-    y_m = Σ_{j ≤ m} (x_j - μ) is cut into ⌊N/n⌋ windows of n samples, from its start on. A straight line (order 1) is taken
-    off in each; F(n) is the root mean square of what is left in all of them. α is the slope of the least-squares line
-    through ln F over ln n. The window sizes grow by a fifth from `smallest` to `largest`, rounded down, each once.
+    y_m = Σ_{j ≤ m} (x_j - μ) is cut into ⌊N/n⌋ windows of n samples, from its start on. A straight
+    line (order 1) is taken off in each; F(n) is the root mean square of what is left in all of
+    them. α is the slope of the least-squares line through ln F over ln n. The window sizes grow by
+    a fifth from `smallest` to `largest`, rounded down, each once.
 
-    White noise has α = 1/2, 1/f noise 1, a random walk 3/2. Below about 10 samples F is steeper than that by itself.
+    White noise has α = 1/2, 1/f noise 1, a random walk 3/2. Below about 10 samples F is steeper
+    than that by itself.
 
     **Arguments:**
 
@@ -75,11 +85,17 @@ def dfa(signal: Real[Array | np.ndarray, "..."], smallest: int = 4, largest: int
     - `smallest` window [samples], at least 4
     - `largest`: by default N/10
 
-    **Raises:** `ValueError` if the signal is constant, not finite, or too short for two sizes of windows.
+    **Raises:** `ValueError` if the signal is constant, not finite, or too short for two sizes of
+    windows.
 
     **Source:** Peng et al. 1994, doi:10.1103/PhysRevE.49.1685.
     """
-    require(smallest >= 4, "smallest", smallest, "give at least 4 samples: a line fits 2 of them exactly")
+    require(
+        smallest >= 4,
+        "smallest",
+        smallest,
+        "give at least 4 samples: a line fits 2 of them exactly",
+    )
     x = one_record(signal, 2)
     longest = x.size / WINDOWS if largest is None else largest
     steps = np.arange(int(np.log(max(longest / smallest, 1)) / np.log(GROWTH)) + 1)

@@ -20,9 +20,10 @@ Bins = Float[Array | np.ndarray, " bins"]
 class SpectrumEstimate(Shown, eqx.Module):
     """A Monte Carlo estimate of an expected Welch spectrum.
 
-    **Fields**, per bin: `frequency` [Hz]; `power` [`unit`²/Hz] and its standard error `stderr`, with the control variate
-    where there is one; `plain_power`, `plain_stderr` without it; `expected`, the exact spectrum of the linear response,
-    or None; `seeds`, how many; `settings`; `unit`.
+    **Fields**, per bin: `frequency` [Hz]; `power` [`unit`²/Hz] and its standard error `stderr`,
+    with the control variate where there is one; `plain_power`, `plain_stderr` without it;
+    `expected`, the exact spectrum of the linear response, or None; `seeds`, how many; `settings`;
+    `unit`.
     """
 
     frequency: Bins
@@ -59,18 +60,23 @@ class SpectrumEstimate(Shown, eqx.Module):
 
     @property
     def nonlinearity(self) -> Bins:
-        """What the linear response misses of each bin, `power / expected - 1`. Raises `ValueError` without control."""
+        """What the linear response misses of each bin, `power / expected - 1`. Raises `ValueError`
+        without control."""
         if self.expected is None:
-            raise ValueError("there is no control variate to compare with: simulate with control=True")
+            raise ValueError(
+                "there is no control variate to compare with: simulate with control=True"
+            )
         return self.power / self.expected - 1
 
     @property
     def variance_reduction(self) -> Bins:
-        """How many times more seeds a plain mean would need for the same error, `(plain_stderr / stderr)²`."""
+        """How many times more seeds a plain mean would need for the same error, `(plain_stderr /
+        stderr)²`."""
         return (self.plain_stderr / self.stderr) ** 2
 
     def plot(self, ax: Any = None, *, log: bool = False) -> Any:
-        """Proportional power with its error band; `log`: both axes logarithmic. Returns the axes."""
+        """Proportional power with its error band; `log`: both axes logarithmic. Returns the
+        axes."""
         return plot.estimate(self, ax, log=log)
 
 
@@ -81,11 +87,14 @@ def estimated(
     settings: SpectrumSettings,
     unit: str,
 ) -> SpectrumEstimate:
-    """From the Welch powers of every seed and, if there are any, those of the linearised task and their expectation."""
+    """From the Welch powers of every seed and, if there are any, those of the linearised task and
+    their expectation."""
     count = len(plain)
 
     def summary(rows):
-        error = rows.std(axis=0, ddof=1) / count**0.5 if count > 1 else np.full(rows.shape[1], np.nan)
+        error = (
+            rows.std(axis=0, ddof=1) / count**0.5 if count > 1 else np.full(rows.shape[1], np.nan)
+        )
         return rows.mean(axis=0), error
 
     control = None if beside is None or expected is None else (*summary(plain - beside), expected)
@@ -93,12 +102,28 @@ def estimated(
 
 
 def from_moments(
-    plain: tuple[Bins, Bins], control: tuple[Bins, Bins, Bins] | None, seeds: int, settings: SpectrumSettings, unit: str
+    plain: tuple[Bins, Bins],
+    control: tuple[Bins, Bins, Bins] | None,
+    seeds: int,
+    settings: SpectrumSettings,
+    unit: str,
 ) -> SpectrumEstimate:
-    """From means and standard errors: of the Welch power, and of what the linearised task leaves of it, whose exact
-    expectation is the third of `control`."""
+    """From means and standard errors: of the Welch power, and of what the linearised task leaves of
+    it, whose exact expectation is the third of `control`."""
     mean, error = plain
     if control is None:
-        return SpectrumEstimate(settings.frequency, mean, error, mean, error, None, seeds, settings, unit)
+        return SpectrumEstimate(
+            settings.frequency, mean, error, mean, error, None, seeds, settings, unit
+        )
     difference, stderr, expected = control
-    return SpectrumEstimate(settings.frequency, expected + difference, stderr, mean, error, expected, seeds, settings, unit)
+    return SpectrumEstimate(
+        settings.frequency,
+        expected + difference,
+        stderr,
+        mean,
+        error,
+        expected,
+        seeds,
+        settings,
+        unit,
+    )

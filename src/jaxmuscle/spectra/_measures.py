@@ -1,4 +1,5 @@
-"""Numbers that describe a force record and its spectrum: variability, regularity, rank correlation, peaks."""
+"""Numbers that describe a force record and its spectrum: variability, regularity, rank correlation,
+peaks."""
 
 from typing import Any, Literal, get_args
 
@@ -24,14 +25,18 @@ def _standard_deviation(signal: Float[Array, "*batch times"]) -> Float[Array, "*
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1.0)), 0.0)
 
 
-def coefficient_of_variation(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch"]:
+def coefficient_of_variation(
+    signal: Real[Array | np.ndarray, "*batch times"],
+) -> Float[Array, "*batch"]:
     """Coefficient of variation, CV = σ / |μ|, along the last axis; differentiable.
 
         jm.spectra.coefficient_of_variation(5 + np.sin(np.arange(1000.0)))
 
-    **Arguments:** `signal` in any unit, time along the last axis. σ divides by the number of samples.
+    **Arguments:** `signal` in any unit, time along the last axis. σ divides by the number of
+    samples.
 
-    **Returns:** a fraction without unit, not a percentage; 0 for a constant signal, infinite for a zero mean.
+    **Returns:** a fraction without unit, not a percentage; 0 for a constant signal, infinite for a
+    zero mean.
 
     **Raises:** `ValueError` for a signal without samples.
     """
@@ -44,7 +49,8 @@ def signal_to_noise(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[A
 
         jm.spectra.signal_to_noise(5 + np.sin(np.arange(1000.0)))
 
-    **Arguments:** `signal` in any unit, time along the last axis. σ divides by the number of samples.
+    **Arguments:** `signal` in any unit, time along the last axis. σ divides by the number of
+    samples.
 
     **Returns:** a ratio without unit and with the sign of the mean; infinite for a constant signal.
 
@@ -56,10 +62,14 @@ def signal_to_noise(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[A
     return jnp.mean(signal, axis=-1) / _standard_deviation(signal)
 
 
-def _record(signal: Real[Array | np.ndarray, "..."], m: int, tolerance: float) -> tuple[np.ndarray, float]:
+def _record(
+    signal: Real[Array | np.ndarray, "..."], m: int, tolerance: float
+) -> tuple[np.ndarray, float]:
     """One checked record, and the radius within which its templates match."""
     require(m >= 1, "m", m, "give the template length, at least 1")
-    require(0 < tolerance < np.inf, "tolerance", tolerance, "give a positive fraction of the deviation")
+    require(
+        0 < tolerance < np.inf, "tolerance", tolerance, "give a positive fraction of the deviation"
+    )
     x = one_record(signal, m + 2, "m + 2 = ")
     return x, tolerance * float(np.std(x))
 
@@ -69,15 +79,19 @@ def _templates(x: Float[np.ndarray, " times"], m: int) -> Float[np.ndarray, "tem
 
 
 def _counts(signal: Any, m: int, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How many templates of m, and of m + 1 samples, match each of their kind, and which of those of m match the last."""
+    """How many templates of m, and of m + 1 samples, match each of their kind, and which of those
+    of m match the last."""
     x, radius = _record(signal, m, tolerance)
     shorter, longer = (_templates(x, length) for length in (m, m + 1))
     last = np.max(np.abs(shorter - shorter[-1]), axis=1) <= radius
     return neighbours(shorter, radius), neighbours(longer, radius), last
 
 
-def regularity(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> tuple[float, float]:
-    """`approximate_entropy` and `sample_entropy`, for which the templates are compared only once."""
+def regularity(
+    signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2
+) -> tuple[float, float]:
+    """`approximate_entropy` and `sample_entropy`, for which the templates are compared only
+    once."""
     shorter, longer, last = _counts(signal, m, tolerance)
     phi, phi_longer = (float(np.mean(np.log(count / len(count)))) for count in (shorter, longer))
     b, a = int(np.sum(shorter[:-1] - 1) - np.sum(last[:-1])), int(np.sum(longer - 1))
@@ -85,15 +99,19 @@ def regularity(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: f
     return phi - phi_longer, none if a == 0 else float(np.log(b / a))
 
 
-def approximate_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> float:
+def approximate_entropy(
+    signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2
+) -> float:
     """Approximate entropy, ApEn = Φ_m - Φ_{m+1}, of one record: low is regular. Not traceable.
 
         jm.spectra.approximate_entropy(np.sin(np.arange(1000.0)))
 
-    Φ_m is the mean of ln C_i over the N - m + 1 templates of m successive samples. C_i is the fraction of
-    templates, i itself included, whose samples all lie within r = `tolerance` σ of those of template i.
+    Φ_m is the mean of ln C_i over the N - m + 1 templates of m successive samples. C_i is the
+    fraction of templates, i itself included, whose samples all lie within r = `tolerance` σ of
+    those of template i.
 
-    **Arguments:** `signal` (times,) in any unit; template length `m`; `tolerance` as a fraction of σ.
+    **Arguments:** `signal` (times,) in any unit; template length `m`; `tolerance` as a fraction of
+    σ.
 
     **Raises:** `ValueError` if the signal is constant, not finite, or has fewer than m + 2 samples.
 
@@ -102,17 +120,22 @@ def approximate_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tol
     return regularity(signal, m, tolerance)[0]
 
 
-def sample_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> float:
+def sample_entropy(
+    signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2
+) -> float:
     """Sample entropy, SampEn = ln(B / A), of one record: low is regular. Not traceable.
 
         jm.spectra.sample_entropy(np.sin(np.arange(1000.0)))
 
-    B and A count the pairs of different templates, of m and of m + 1 successive samples and both starting in
-    the first N - m samples, whose samples all lie within r = `tolerance` σ of each other.
+    B and A count the pairs of different templates, of m and of m + 1 successive samples and both
+    starting in the first N - m samples, whose samples all lie within r = `tolerance` σ of each
+    other.
 
-    **Arguments:** `signal` (times,) in any unit; template length `m`; `tolerance` as a fraction of σ.
+    **Arguments:** `signal` (times,) in any unit; template length `m`; `tolerance` as a fraction of
+    σ.
 
-    **Returns:** the entropy; infinite if no longer templates match, NaN if no shorter ones do either.
+    **Returns:** the entropy; infinite if no longer templates match, NaN if no shorter ones do
+    either.
 
     **Raises:** `ValueError` if the signal is constant, not finite, or has fewer than m + 2 samples.
 
@@ -130,11 +153,17 @@ def spearman(a: Real[Array | np.ndarray, "..."], b: Real[Array | np.ndarray, "..
 
     **Returns:** a number from -1 to 1 (`scipy.stats.spearmanr`).
 
-    **Raises:** `ValueError` for unequal shapes, fewer than 3 values, and constant or non-finite values.
+    **Raises:** `ValueError` for unequal shapes, fewer than 3 values, and constant or non-finite
+    values.
     """
     left, right = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     paired = left.shape == right.shape and left.ndim == 1 and left.size >= 3
-    require(paired, "shapes of a, b", (left.shape, right.shape), "give two equally long rows of 3 or more")
+    require(
+        paired,
+        "shapes of a, b",
+        (left.shape, right.shape),
+        "give two equally long rows of 3 or more",
+    )
     for name, values in (("a", left), ("b", right)):
         ranked = np.all(np.isfinite(values)) and np.ptp(values) > 0
         require(ranked, name, values, "ranks need finite values that are not all equal")
@@ -147,7 +176,8 @@ def normalised(
     *,
     mvc: float | Real[Array | np.ndarray, ""] | None = None,
 ) -> Float[Array, "*batch times"]:
-    """The signal over its mean, its largest absolute value, or the maximal voluntary contraction (MVC).
+    """The signal over its mean, its largest absolute value, or the maximal voluntary contraction
+    (MVC).
 
         shares = jm.spectra.normalised(5 + np.sin(np.arange(1000.0)), "maximum")
 
@@ -157,9 +187,11 @@ def normalised(
     - `by`: one of `"mean"`, `"maximum"`, `"mvc"`
     - `mvc` [unit]: for `by="mvc"` only
 
-    **Returns:** the signal without unit, same shape and dtype; not finite where the reference is zero.
+    **Returns:** the signal without unit, same shape and dtype; not finite where the reference is
+    zero.
 
-    **Raises:** `ValueError` for an unknown `by`, and an `mvc` that is missing, not positive, or not needed.
+    **Raises:** `ValueError` for an unknown `by`, and an `mvc` that is missing, not positive, or not
+    needed.
     """
     signal = floating(signal)
     require(by in get_args(Reference), "by", by, f"choose one of {', '.join(get_args(Reference))}")
@@ -177,8 +209,9 @@ def normalised(
 class Peak(eqx.Module):
     """One maximum of a spectrum.
 
-    `bin` number, `frequency` of that bin [Hz], `interpolated` frequency [Hz], proportional `power`, and
-    `prominence`, the height in proportional power above the higher of the two valleys beside it.
+    `bin` number, `frequency` of that bin [Hz], `interpolated` frequency [Hz], proportional `power`,
+    and `prominence`, the height in proportional power above the higher of the two valleys beside
+    it.
     """
 
     bin: int
@@ -189,7 +222,8 @@ class Peak(eqx.Module):
 
 
 class Peaks(eqx.Module):
-    """The `maximum` of a spectrum, wherever it lies, and the interior `local_maxima` by rising frequency.
+    """The `maximum` of a spectrum, wherever it lies, and the interior `local_maxima` by rising
+    frequency.
 
     A maximum inside the range is one of the local maxima as well.
     """
@@ -204,25 +238,37 @@ def peaks(spectrum: Spectrum, *, min_prominence: float = 0.01) -> Peaks:
         spectrum = jm.expected_spectrum(jm.Isometric())
         jm.spectra.peaks(spectrum).maximum.frequency
 
-    The interpolated frequency is the vertex of the parabola through the log power l of a bin and of its two
-    neighbours, f_k + Δf (l_{k-1} - l_{k+1}) / (2 (l_{k-1} - 2 l_k + l_{k+1})). The prominence of a maximum is its
-    height in proportional power above the higher of the two valleys beside it (the lowest bins between it and a higher
-    maximum, or the end of the spectrum). A maximum in the first or last bin is no local maximum and is not interpolated;
-    its prominence is its height above the lowest bin.
+    The interpolated frequency is the vertex of the parabola through the log power l of a bin and of
+    its two neighbours, f_k + Δf (l_{k-1} - l_{k+1}) / (2 (l_{k-1} - 2 l_k + l_{k+1})). The
+    prominence of a maximum is its height in proportional power above the higher of the two valleys
+    beside it (the lowest bins between it and a higher maximum, or the end of the spectrum). A
+    maximum in the first or last bin is no local maximum and is not interpolated; its prominence is
+    its height above the lowest bin.
 
-    **Arguments:** `spectrum` without leading axes; `min_prominence` of local maxima, relative to the
-    maximum (by default 1 %: smaller ones are mostly the scatter of the estimate).
+    **Arguments:** `spectrum` without leading axes; `min_prominence` of local maxima, relative to
+    the maximum (by default 1 %: smaller ones are mostly the scatter of the estimate).
 
-    **Returns:** `maximum` and `local_maxima` (by rising frequency), each with its number `bin` (k of `SpectrumSettings`,
-    not the place in the array), `frequency` and `interpolated` frequency [Hz], proportional `power` and `prominence`.
+    **Returns:** `maximum` and `local_maxima` (by rising frequency), each with its number `bin` (k
+    of `SpectrumSettings`, not the place in the array), `frequency` and `interpolated` frequency
+    [Hz], proportional `power` and `prominence`.
 
-    **Raises:** `ValueError` for leading axes, fewer than 3 bins, and power that is not finite or all zero.
+    **Raises:** `ValueError` for leading axes, fewer than 3 bins, and power that is not finite or
+    all zero.
     """
     p = np.asarray(spectrum.proportional, dtype=float)
     one = p.ndim == 1 and p.size >= 3
-    require(one, "spectrum.power shape", p.shape, "give one spectrum of 3 bins or more, as spectrum.mean()")
-    require(np.all(np.isfinite(p)), "spectrum.power", spectrum.power, "give finite power, not all zero")
-    require(0 <= min_prominence <= 1, "min_prominence", min_prominence, "give a fraction of the maximum")
+    require(
+        one,
+        "spectrum.power shape",
+        p.shape,
+        "give one spectrum of 3 bins or more, as spectrum.mean()",
+    )
+    require(
+        np.all(np.isfinite(p)), "spectrum.power", spectrum.power, "give finite power, not all zero"
+    )
+    require(
+        0 <= min_prominence <= 1, "min_prominence", min_prominence, "give a fraction of the maximum"
+    )
     indices, found = scipy.signal.find_peaks(p, prominence=min_prominence * p.max())
     pairs = zip(indices, found["prominences"], strict=True)
     top = int(np.argmax(p))
@@ -231,7 +277,9 @@ def peaks(spectrum: Spectrum, *, min_prominence: float = 0.01) -> Peaks:
     return Peaks(_peak(spectrum, p, top, height), tuple(_peak(spectrum, p, k, h) for k, h in pairs))
 
 
-def _peak(spectrum: Spectrum, p: Float[np.ndarray, " bins"], k: int | np.integer, prominence: float) -> Peak:
+def _peak(
+    spectrum: Spectrum, p: Float[np.ndarray, " bins"], k: int | np.integer, prominence: float
+) -> Peak:
     f = np.asarray(spectrum.frequency, dtype=float)
     interpolated = f[k]
     if 0 < k < p.size - 1 and np.all(p[k - 1 : k + 2] > 0):

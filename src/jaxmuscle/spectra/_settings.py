@@ -21,7 +21,12 @@ Window = Literal["hann", "hamming", "boxcar", "dpss"]
 Detrend = Literal["constant", "linear", "none"]
 FilterDirection = Literal["forward", "both"]
 Sampling = Literal["instant", "average", "filtered"]
-_CHOICES = {"window": Window, "detrend": Detrend, "filter_direction": FilterDirection, "sampling": Sampling}
+_CHOICES = {
+    "window": Window,
+    "detrend": Detrend,
+    "filter_direction": FilterDirection,
+    "sampling": Sampling,
+}
 
 
 COSINES: dict[Window, float] = {"hann": 0.5, "hamming": 0.54, "boxcar": 1.0}
@@ -32,16 +37,15 @@ NAMED: dict[str, dict[str, Any]] = {
     "multitaper": _SLOW | {"first_bin": 2, "window": "dpss", "tapers": 3},
     "pwelch": {"window": "hamming", "detrend": "none"},
 }
-FASTEST, LENGTH, ORDER = (
-    1e9,
-    2**22,
-    50,
-)  # rate [Hz], samples of a segment, order of the low-pass: what is more is a slip, and fills the memory
-_AROUND = ("filter_order", "filter_cutoff", "filter_direction", "sampling")  # of the signal, not of its spectrum
+# Rate [Hz], samples of a segment, order of the low-pass: more is a slip, and fills the memory.
+FASTEST, LENGTH, ORDER = (1e9, 2**22, 50)
+# of the signal, not of its spectrum
+_AROUND = ("filter_order", "filter_cutoff", "filter_direction", "sampling")
 
 
 def taper_of(window: Window, samples: int) -> Float[np.ndarray, " samples"]:
-    """`a + (1 - a) cos x`, x from -π to π in so many steps: that of `scipy.signal`, which takes long to import."""
+    """`a + (1 - a) cos x`, x from -π to π in so many steps: that of `scipy.signal`, which takes
+    long to import."""
     a = COSINES[window]
     return a + (1 - a) * np.cos(np.linspace(-np.pi, np.pi, samples + 1)[:-1])
 
@@ -59,7 +63,8 @@ def require(holds: bool | np.bool, name: str, value: object, remedy: str) -> Non
 class SpectrumSettings(Spelled, eqx.Module):
     """How a spectrum is estimated; every choice the papers leave open is a field.
 
-    The defaults are the procedure of Slifkin & Newell (1999, J Exp Psychol HPP 25(3):837-851); `named` has others.
+    The defaults are the procedure of Slifkin & Newell (1999, J Exp Psychol HPP 25(3):837-851);
+    `named` has others.
 
     | field | meaning |
     |---|---|
@@ -74,7 +79,7 @@ class SpectrumSettings(Spelled, eqx.Module):
     | `sampling` | `"instant"`, the `"average"` over a sampling interval, or `"filtered"`, before, against aliases |
 
     **Raises:** `ValueError` naming the field, its value and the remedy.
-    """
+    """  # noqa: E501 (a row of a table is one line)
 
     rate: float = eqx.field(static=True, default=100.0, converter=_python)
     length: int = eqx.field(static=True, default=256, converter=_python)
@@ -92,25 +97,60 @@ class SpectrumSettings(Spelled, eqx.Module):
     def __check_init__(self):
         def check(name: str, kind: type, valid: Callable[[Any], bool], remedy: str) -> None:
             value = getattr(self, name)
-            require(isinstance(value, kind) and not isinstance(value, bool) and valid(value), name, value, remedy)
+            require(
+                isinstance(value, kind) and not isinstance(value, bool) and valid(value),
+                name,
+                value,
+                remedy,
+            )
 
         half = self.length // 2 if isinstance(self.length, int) else 0
-        check("rate", numbers.Real, lambda f: 0 < f <= FASTEST, f"give a sampling rate above 0 Hz, at most {FASTEST:g} Hz")
-        check("length", int, lambda n: 8 <= n <= LENGTH, f"give a whole number of samples, 8 to {LENGTH}")
-        check("last_bin", int, lambda k: 1 <= k <= half, f"give a bin from 1 to length // 2 = {half}")
+        check(
+            "rate",
+            numbers.Real,
+            lambda f: 0 < f <= FASTEST,
+            f"give a sampling rate above 0 Hz, at most {FASTEST:g} Hz",
+        )
+        check(
+            "length",
+            int,
+            lambda n: 8 <= n <= LENGTH,
+            f"give a whole number of samples, 8 to {LENGTH}",
+        )
+        check(
+            "last_bin", int, lambda k: 1 <= k <= half, f"give a bin from 1 to length // 2 = {half}"
+        )
         below = f"give a bin from 0 (the mean) to last_bin = {self.last_bin}"
         check("first_bin", int, lambda k: 0 <= k <= self.last_bin, below)
-        check("overlap", numbers.Real, lambda x: 0 <= x < 1, "give a fraction of a segment, 0 to below 1")
-        check("filter_order", int, lambda n: 1 <= n <= ORDER, f"give a whole number from 1 to {ORDER}")
+        check(
+            "overlap",
+            numbers.Real,
+            lambda x: 0 <= x < 1,
+            "give a fraction of a segment, 0 to below 1",
+        )
+        check(
+            "filter_order", int, lambda n: 1 <= n <= ORDER, f"give a whole number from 1 to {ORDER}"
+        )
         if self.filter_cutoff is not None:
-            inside = f"give a frequency from 0 to rate / 2 = {self.rate / 2:g} Hz, or None for no filter"
+            inside = (
+                f"give a frequency from 0 to rate / 2 = {self.rate / 2:g} Hz, or None for no filter"
+            )
             check("filter_cutoff", numbers.Real, lambda f: 0 < f < self.rate / 2, inside)
         for name, choice in _CHOICES.items():
             known = get_args(choice)
             check(name, str, known.__contains__, f"choose one of {', '.join(known)}")
         slepian = self.window == "dpss"
-        remedy = f"give at least 2, at most length / 8 = {self.length // 8}" if slepian else "give 1, or window='dpss'"
-        check("tapers", int, lambda n: 2 <= n <= max(self.length // 8, 2) if slepian else n == 1, remedy)
+        remedy = (
+            f"give at least 2, at most length / 8 = {self.length // 8}"
+            if slepian
+            else "give 1, or window='dpss'"
+        )
+        check(
+            "tapers",
+            int,
+            lambda n: 2 <= n <= max(self.length // 8, 2) if slepian else n == 1,
+            remedy,
+        )
 
     @classmethod
     def named(cls, name: str) -> "SpectrumSettings":
@@ -123,23 +163,27 @@ class SpectrumSettings(Spelled, eqx.Module):
         | `"multitaper"` | the same with three Slepian tapers (NW = 2, bands of 0.4 Hz) from 0.2 Hz on |
         | `"pwelch"` | MATLAB's defaults: Hamming window and no detrend, so the mean leaks into bin 1 |
 
-        **Raises:** `ValueError` for another name. **Source:** Thomson 1982, doi:10.1109/PROC.1982.12433 (multitaper).
-        """
-        require(isinstance(name, str) and name in NAMED, "settings", name, choices(str(name), NAMED))
+        **Raises:** `ValueError` for another name. **Source:** Thomson 1982,
+        doi:10.1109/PROC.1982.12433 (multitaper).
+        """  # noqa: E501 (a row of a table is one line)
+        require(
+            isinstance(name, str) and name in NAMED, "settings", name, choices(str(name), NAMED)
+        )
         return cls(**NAMED[name])
 
     @classmethod
     def pwelch(cls) -> "SpectrumSettings":
         """MATLAB's `pwelch` defaults, `named("pwelch")`.
 
-        Two details stay as they are here: `length` (MATLAB would cut the signal into eight segments) and the
-        periodic form of the window (MATLAB's is symmetric).
+        Two details stay as they are here: `length` (MATLAB would cut the signal into eight
+        segments) and the periodic form of the window (MATLAB's is symmetric).
         """
         return cls.named("pwelch")
 
     @property
     def name(self) -> str | None:
-        """Which of the names of `named` these settings have, without regard to low-pass and sampling; `None` if none."""
+        """Which of the names of `named` these settings have, without regard to low-pass and
+        sampling; `None` if none."""
         plain = self.replace(**{field: getattr(SpectrumSettings(), field) for field in _AROUND})
         return next((name for name in NAMED if plain == SpectrumSettings.named(name)), None)
 
@@ -168,53 +212,78 @@ class SpectrumSettings(Spelled, eqx.Module):
         return np.asarray(scipy.signal.butter(order, cutoff, fs=self.rate, output="sos"))
 
     def segments(self, samples: int) -> int:
-        """Number of whole Welch segments in a window of that many samples, 0 if it is too short for one."""
+        """Number of whole Welch segments in a window of that many samples, 0 if it is too short for
+        one."""
         return max((samples - self.length) // self.step + 1, 0)
 
     def degrees_of_freedom(self, segments: int) -> float:
         """Equivalent degrees of freedom ν of a bin averaged over K segments: power ~ S χ²_ν / ν.
 
-        ν = 2K / (ρ_0² + 2 Σ_j (1 - j/K) ρ_j²), where ρ_j² = Σ_tu (Σ_m w_tm w_{u, m + j step})², Σ_tm w_tm² = 1,
-        correlates segments j apart with tapers t and u, for a density that is flat across a bin; half-overlapping Hann
-        segments have ρ_1 = 1/6 only, and T tapers ρ_0² = 1/T. Independent trials add their ν.
+        ν = 2K / (ρ_0² + 2 Σ_j (1 - j/K) ρ_j²), where ρ_j² = Σ_tu (Σ_m w_tm w_{u, m + j step})²,
+        Σ_tm w_tm² = 1, correlates segments j apart with tapers t and u, for a density that is flat
+        across a bin; half-overlapping Hann segments have ρ_1 = 1/6 only, and T tapers ρ_0² = 1/T.
+        Independent trials add their ν.
 
-        **Raises:** `ValueError` unless K >= 1. **Source:** Welch 1967, doi:10.1109/TAU.1967.1161901.
+        **Raises:** `ValueError` unless K >= 1. **Source:** Welch 1967,
+        doi:10.1109/TAU.1967.1161901.
         """
-        require(segments >= 1, "segments", segments, "give the number of averaged segments, at least 1")
+        require(
+            segments >= 1, "segments", segments, "give the number of averaged segments, at least 1"
+        )
         w, n, step = tapers_of(self, self.length), self.length, self.step
         lags = range(min(segments - 1, (n - 1) // step) + 1)
         squares = [float(np.sum((w[:, : n - j * step] @ w[:, j * step :].T) ** 2)) for j in lags]
-        return 2 * segments / (squares[0] + 2 * sum((1 - j / segments) * squares[j] for j in lags[1:]))
+        return (
+            2 * segments / (squares[0] + 2 * sum((1 - j / segments) * squares[j] for j in lags[1:]))
+        )
 
     def to_dict(self, *, whole: bool = False) -> dict[str, Any]:
         """The fields as TOML and JSON hold them; no cut-off is `"none"`, as TOML has no null.
 
         A single taper is left out, unless the table is to be `whole`.
         """
-        fields = [field.name for field in dataclasses.fields(self) if field.name != "tapers" or self.tapers > 1 or whole]
+        fields = [
+            field.name
+            for field in dataclasses.fields(self)
+            if field.name != "tapers" or self.tapers > 1 or whole
+        ]
         values = {name: getattr(self, name) for name in fields}
         return values | ({"filter_cutoff": "none"} if self.filter_cutoff is None else {})
 
     @classmethod
     def names(cls, *, whole: bool = True) -> tuple[str, ...]:
-        """Names of all settings; without `whole` all but `tapers`, which a table may lack (it is then a single one)."""
-        return tuple(field.name for field in dataclasses.fields(cls) if whole or field.name != "tapers")
+        """Names of all settings; without `whole` all but `tapers`, which a table may lack (it is
+        then a single one)."""
+        return tuple(
+            field.name for field in dataclasses.fields(cls) if whole or field.name != "tapers"
+        )
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any], *, needed: Iterable[str] = ()) -> "SpectrumSettings":
-        """Settings from a table as `to_dict` writes it; what it does not name keeps its default, unless it is `needed`.
+    def from_dict(
+        cls, values: Mapping[str, Any], *, needed: Iterable[str] = ()
+    ) -> "SpectrumSettings":
+        """Settings from a table as `to_dict` writes it; what it does not name keeps its default,
+        unless it is `needed`.
 
-        **Raises:** `ValueError` for an unknown name, with the nearest known one, for one missing, and for an invalid value.
+        **Raises:** `ValueError` for an unknown name, with the nearest known one, for one missing,
+        and for an invalid value.
         """
         known = [field.name for field in dataclasses.fields(cls)]
         for name in needed:
             if name not in values:
-                raise ValueError(f"has no key {name!r}: give it; a setting that is not there gets no default")
+                raise ValueError(
+                    f"has no key {name!r}: give it; a setting that is not there gets no default"
+                )
         for name, value in values.items():
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
-            remedy = f"no such spectrum setting, did you mean {near!r}? Known are {', '.join(known)}"
+            remedy = (
+                f"no such spectrum setting, did you mean {near!r}? Known are {', '.join(known)}"
+            )
             require(name in known, name, value, remedy)
-        given = {**values, **({"filter_cutoff": None} if values.get("filter_cutoff") == "none" else {})}
+        given = {
+            **values,
+            **({"filter_cutoff": None} if values.get("filter_cutoff") == "none" else {}),
+        }
         for field in dataclasses.fields(cls):
             if field.name in given:  # ranges are checked by the constructor
                 kind: Any = field.type
@@ -228,9 +297,12 @@ class SpectrumSettings(Spelled, eqx.Module):
 
 @functools.lru_cache(maxsize=32)
 def tapers_of(settings: SpectrumSettings, samples: int) -> Float[np.ndarray, "tapers samples"]:
-    """Tapers for so many samples, one a row; all squares sum to 1, so power is `2 / rate Σ_t |Σ_m w_tm x_m e^..|²`."""
+    """Tapers for so many samples, one a row; all squares sum to 1, so power is `2 / rate Σ_t |Σ_m
+    w_tm x_m e^..|²`."""
     if settings.window == "dpss":
-        rows = np.asarray(scipy.signal.windows.dpss(samples, (settings.tapers + 1) / 2, settings.tapers))
+        rows = np.asarray(
+            scipy.signal.windows.dpss(samples, (settings.tapers + 1) / 2, settings.tapers)
+        )
     else:
         rows = taper_of(settings.window, samples)[None]
     return rows / np.sqrt(np.sum(rows**2))

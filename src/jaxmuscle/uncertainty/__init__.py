@@ -1,4 +1,5 @@
-"""What data leave open: profile likelihood, posterior, identifiability and measurements that would help.
+"""What data leave open: profile likelihood, posterior, identifiability and measurements that would
+help.
 
 Takes a fit, never makes one.
 """

@@ -1,4 +1,5 @@
-"""Hamiltonian chains of a whitened density, in one program; step size and metric adapted on all of them together."""
+"""Hamiltonian chains of a whitened density, in one program; step size and metric adapted on all of
+them together."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -12,19 +13,24 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle._common.programs import kept, kept_to_run_long
 
-Density = Any  # has `size`, `centre`, `scale` that whiten, and `log_density` of whitened coordinates
+# has `size`, `centre`, `scale` that whiten, and `log_density` of whitened coordinates
+Density = Any
 BLOCK = 50
 ADAPTATIONS = (2, 3, 5)  # blocks of warm-up; the metric is learnt after each but the last
 TARGET_ACCEPTANCE = 0.95
-LONGEST = 4.0  # of a trajectory, in standard deviations; its length is drawn anew for every draw, from 0 on
-ALIKE = 0.5  # autocorrelation of successive draws of the warm-up, from which on trajectories become twice as long
+# of a trajectory, in standard deviations; its length is drawn anew for every draw, from 0 on
+LONGEST = 4.0
+# autocorrelation of successive draws of the warm-up, from which on trajectories become twice as
+# long
+ALIKE = 0.5
 MOST_STEPS = 128
 SPREAD = 1.5
 SHRINK = 20  # draws that the old metric counts for when a new one is learnt
 
 
 class Chains(NamedTuple):
-    """Draws of the unbounded coordinates and the offset, and how each was made; leading axes chain, draw."""
+    """Draws of the unbounded coordinates and the offset, and how each was made; leading axes chain,
+    draw."""
 
     s: Float[np.ndarray, "chains draws sampled"]
     log_density: Float[np.ndarray, "chains draws"]
@@ -37,7 +43,8 @@ class Chains(NamedTuple):
 class _State(NamedTuple):
     """Of every chain position, log density and its gradient; and how far the step size is adapted.
 
-    The fields of blackjax's own states without their classes, so that a program is kept, and loaded without blackjax.
+    The fields of blackjax's own states without their classes, so that a program is kept, and loaded
+    without blackjax.
     """
 
     chains: Any
@@ -48,11 +55,21 @@ def _tools() -> tuple[Any, Any, Any, Any]:
     """HMC and the class of its states, dual averaging and the class of its states."""
     try:
         import blackjax
-        from blackjax.adaptation.step_size import DualAveragingAdaptationState, dual_averaging_adaptation
+        from blackjax.adaptation.step_size import (
+            DualAveragingAdaptationState,
+            dual_averaging_adaptation,
+        )
         from blackjax.mcmc.hmc import HMCState
     except ImportError as error:
-        raise ImportError("posterior needs blackjax and arviz-stats: pip install blackjax arviz-stats") from error
-    return blackjax.hmc, HMCState, dual_averaging_adaptation(TARGET_ACCEPTANCE), DualAveragingAdaptationState
+        raise ImportError(
+            "posterior needs blackjax and arviz-stats: pip install blackjax arviz-stats"
+        ) from error
+    return (
+        blackjax.hmc,
+        HMCState,
+        dual_averaging_adaptation(TARGET_ACCEPTANCE),
+        DualAveragingAdaptationState,
+    )
 
 
 def _strong(tree: Any) -> Any:
@@ -69,9 +86,14 @@ def _first(density: Density, positions: Array | np.ndarray) -> Any:
 
 @kept_to_run_long
 def _block(
-    density: Density, key: Array, state: Any, adapting: Array | np.ndarray, longest: Array | np.ndarray
+    density: Density,
+    key: Array,
+    state: Any,
+    adapting: Array | np.ndarray,
+    longest: Array | np.ndarray,
 ) -> tuple[Any, Any]:
-    """`BLOCK` draws of every chain; while `adapting` the step size follows the mean acceptance of all chains.
+    """`BLOCK` draws of every chain; while `adapting` the step size follows the mean acceptance of
+    all chains.
 
     All chains make the same number of steps: none waits for another.
     """
@@ -83,15 +105,24 @@ def _block(
     def one(state, key):
         size = jnp.where(adapting, jnp.exp(state.adaptation.log_step_size), settled)
         length, *keys = jax.random.split(key, 1 + len(state.chains.logdensity))
-        steps = jnp.clip(jnp.ceil(jax.random.uniform(length) * longest / size), 1, MOST_STEPS).astype(int)
+        steps = jnp.clip(
+            jnp.ceil(jax.random.uniform(length) * longest / size), 1, MOST_STEPS
+        ).astype(int)
         metric = jnp.ones(density.size)
-        chains, info = jax.vmap(lambda key, chain: kernel(key, chain, density.log_density, size, metric, steps))(
-            jnp.stack(keys), state.chains
-        )
+        chains, info = jax.vmap(
+            lambda key, chain: kernel(key, chain, density.log_density, size, metric, steps)
+        )(jnp.stack(keys), state.chains)
         learnt = update(state.adaptation, jnp.mean(info.acceptance_rate))
-        adaptation = jax.tree.map(lambda new, old: jnp.where(adapting, new, old), learnt, state.adaptation)
-        made = (chains.position, chains.logdensity, info.acceptance_rate,
-                jnp.broadcast_to(steps, info.acceptance_rate.shape), info.is_divergent)  # fmt: skip
+        adaptation = jax.tree.map(
+            lambda new, old: jnp.where(adapting, new, old), learnt, state.adaptation
+        )
+        made = (
+            chains.position,
+            chains.logdensity,
+            info.acceptance_rate,
+            jnp.broadcast_to(steps, info.acceptance_rate.shape),
+            info.is_divergent,
+        )
         return _State(chains, adaptation), (*made, size)
 
     state, made = jax.lax.scan(one, state, jax.random.split(key, BLOCK))
@@ -101,14 +132,17 @@ def _block(
 def _learnt(density: Density, white: np.ndarray) -> Density:
     """Whitened anew by the covariance of draws, the old metric counting as `SHRINK` of them."""
     count = len(white)
-    covariance = (count * np.cov(white.T, bias=True) + SHRINK * np.eye(white.shape[1])) / (count + SHRINK)
+    covariance = (count * np.cov(white.T, bias=True) + SHRINK * np.eye(white.shape[1])) / (
+        count + SHRINK
+    )
     scale = np.asarray(density.scale) @ np.linalg.cholesky(covariance)
     centre = np.asarray(density.centre) + np.asarray(density.scale) @ white.mean(axis=0)
     return eqx.tree_at(lambda m: (m.centre, m.scale), density, (centre, scale))
 
 
 def _alike(density: Density, white: np.ndarray) -> float:
-    """The largest autocorrelation of successive draws among the coordinates; axes draw, chain, coordinate."""
+    """The largest autocorrelation of successive draws among the coordinates; axes draw, chain,
+    coordinate."""
     away = (white - white.mean(axis=(0, 1))) @ np.asarray(density.scale).T
     return float(np.max(np.sum(away[1:] * away[:-1], axis=(0, 1)) / np.sum(away**2, axis=(0, 1))))
 
@@ -119,12 +153,18 @@ def _moved(old: Density, new: Density, white: Array) -> np.ndarray:
 
 
 def sample(
-    density: Density, key: Array, chains: int, draws: Sequence[int], warmup: int, tell: Callable[[str, float], None]
+    density: Density,
+    key: Array,
+    chains: int,
+    draws: Sequence[int],
+    warmup: int,
+    tell: Callable[[str, float], None],
 ) -> Iterator[tuple[Chains, Density]]:
-    """Chains from dispersed starts, and the density whitened as they were drawn: at each of these rising numbers of draws.
+    """Chains from dispersed starts, and the density whitened as they were drawn: at each of these
+    rising numbers of draws.
 
-    The longer chains go on where the shorter ones ended. `warmup` is rounded up to blocks. Needs double precision. Raises
-    `ValueError` if no start has a finite density.
+    The longer chains go on where the shorter ones ended. `warmup` is rounded up to blocks. Needs
+    double precision. Raises `ValueError` if no start has a finite density.
     """
     lengths = _sample(density, key, chains, draws, warmup, tell)
     for _ in draws:
@@ -134,7 +174,12 @@ def sample(
 
 
 def _sample(
-    density: Density, key: Array, chains: int, draws: Sequence[int], warmup: int, tell: Callable[[str, float], None]
+    density: Density,
+    key: Array,
+    chains: int,
+    draws: Sequence[int],
+    warmup: int,
+    tell: Callable[[str, float], None],
 ) -> Iterator[tuple[Chains, Density]]:
     tell("compiling the sampler", 0.0)
     blocks = max(len(ADAPTATIONS), -(-warmup // BLOCK))
@@ -175,14 +220,18 @@ def _sample(
 
 
 def _dispersed(density: Density, key: Array, chains: int) -> np.ndarray:
-    """Starts about the maximum, wider than the posterior; nearer where the density is not finite."""
+    """Starts about the maximum, wider than the posterior; nearer where the density is not
+    finite."""
     away = SPREAD * np.asarray(_normal(key, (chains, density.size)))
     for _ in range(6):
         finite = np.isfinite(np.asarray(_first(density, away).chains[1]))
         if np.all(finite):
             return away
         away = np.where(finite[:, None], away, 0.5 * away)
-    raise ValueError("the posterior density is not finite about its maximum: the fitted task is at the edge of stability")
+    raise ValueError(
+        "the posterior density is not finite about its maximum: the fitted task is at the edge of"
+        " stability"
+    )
 
 
 @kept

@@ -40,9 +40,11 @@ def information_of(problem: FitProblem, seen: Expansion) -> Float[np.ndarray, "f
 
 
 def opened(problem: FitProblem) -> FitProblem:
-    """The problem with the `open_masses` free, too, after all else and with their usual prior: θ = 0 are those of the tasks.
+    """The problem with the `open_masses` free, too, after all else and with their usual prior: θ =
+    0 are those of the tasks.
 
-    The fit of a moved record finds m_z and lets m_w be free, and what else is known of the person helps with that.
+    The fit of a moved record finds m_z and lets m_w be free, and what else is known of the person
+    helps with that.
     """
     masses, c = open_masses(problem), problem.coordinates
     if not masses:
@@ -53,59 +55,88 @@ def opened(problem: FitProblem) -> FitProblem:
     for i, part in enumerate(problem.parts):
         own = {base_of(name): place for name, place in places.items() if i in masses[name]}
         coordinates = _widened(part.coordinates, {name: part.task[name] for name in own})
-        parts.append(dataclasses.replace(part, coordinates=coordinates, columns=(*part.columns, *own.values())))
-    return dataclasses.replace(problem, parts=tuple(parts), coordinates=_widened(c, first),
-                               prior=np.append(problem.prior, np.ones(len(masses))))  # fmt: skip
+        parts.append(
+            dataclasses.replace(
+                part, coordinates=coordinates, columns=(*part.columns, *own.values())
+            )
+        )
+    return dataclasses.replace(
+        problem,
+        parts=tuple(parts),
+        coordinates=_widened(c, first),
+        prior=np.append(problem.prior, np.ones(len(masses))),
+    )
 
 
 def prior_beside_a_motion(problem: FitProblem) -> Float[np.ndarray, " free"]:
-    """Precision of the prior that θ has in a fit with a moved record: there stiffness and damping have their usual one.
+    """Precision of the prior that θ has in a fit with a moved record: there stiffness and damping
+    have their usual one.
 
     A fit of held records by a model with activation takes a narrower one, if none is given.
     """
     if all(part.task.activation is None for part in problem.parts):
         return problem.prior
     c = problem.coordinates
-    usual = {n: PARAMETERS[base_of(n)].prior_sd for n, sd in zip(c.names, c.sd, strict=True)
-             if base_of(n) in COEFFICIENTS and sd == NARROW}  # fmt: skip
-    return problem.prior * np.array([(NARROW / usual[n]) ** 2 if n in usual else 1.0 for n in c.names])
+    usual = {
+        n: PARAMETERS[base_of(n)].prior_sd
+        for n, sd in zip(c.names, c.sd, strict=True)
+        if base_of(n) in COEFFICIENTS and sd == NARROW
+    }
+    return problem.prior * np.array(
+        [(NARROW / usual[n]) ** 2 if n in usual else 1.0 for n in c.names]
+    )
 
 
 def _widened(c: Coordinates, values: Mapping[str, Any]) -> Coordinates:
     """These, and masses of these values with their usual prior."""
     rows, unbounded = [PARAMETERS[base_of(name)] for name in values], np.full(len(values), np.inf)
-    return Coordinates((*c.names, *values), np.append(c.centre, [float(value) for value in values.values()]),
-                       np.append(c.sd, [row.prior_sd for row in rows]),
-                       np.append(c.positive, np.array([row.positive for row in rows], bool)),
-                       np.append(c.low, -unbounded), np.append(c.high, unbounded))  # fmt: skip
+    return Coordinates(
+        (*c.names, *values),
+        np.append(c.centre, [float(value) for value in values.values()]),
+        np.append(c.sd, [row.prior_sd for row in rows]),
+        np.append(c.positive, np.array([row.positive for row in rows], bool)),
+        np.append(c.low, -unbounded),
+        np.append(c.high, unbounded),
+    )
 
 
 def design_information(
     problem: FitProblem, theta: Float[np.ndarray, " free"], design: Design
 ) -> Float[np.ndarray, "free free"]:
-    """Fisher information about a fit's θ in a design; what is separate in it is eliminated, without a prior of its own.
+    """Fisher information about a fit's θ in a design; what is separate in it is eliminated, without
+    a prior of its own.
 
-    Raises `ValueError` for a task without linear response or whose insertion cannot be moved as the design says, unknown
-    names in `separate`, and a coefficient of variation or mean of an output that is zero.
+    Raises `ValueError` for a task without linear response or whose insertion cannot be moved as the
+    design says, unknown names in `separate`, and a coefficient of variation or mean of an output
+    that is zero.
     """
     names = problem.coordinates.names
     for name in design.separate:
         if name not in names:
-            raise ValueError(f"{design.name}: separate: {name!r} is not free in the fit; free are {', '.join(names)}")
+            raise ValueError(
+                f"{design.name}: separate: {name!r} is not free in the fit; free are"
+                f" {', '.join(names)}"
+            )
     like = design.like(problem)
     given = like.task if design.task is None else design.task
     if design.lengthening is not None and not isinstance(given, PrescribedLength):
-        raise ValueError(f"{design.name}: lengthening: in {type(given).__name__} no motor moves the insertion; give "
-                         "task=jaxmuscle.PrescribedLength(...)")  # fmt: skip
+        raise ValueError(
+            f"{design.name}: lengthening: in {type(given).__name__} no motor moves the insertion;"
+            " give task=jaxmuscle.PrescribedLength(...)"
+        )
     settings = like.target.settings if design.settings is None else design.settings
     task: Any = given.with_parts(settings=settings)
     has_response(task, required=True)
     own, coordinates = coordinates_of(like, theta, task)
     local = _local(like, coordinates, task, design)
-    here = dataclasses.replace(problem, parts=(local,), coordinates=coordinates, prior=problem.prior[own])
+    here = dataclasses.replace(
+        problem, parts=(local,), coordinates=coordinates, prior=problem.prior[own]
+    )
     seen = seen_here(here, theta[own])
     (moments,) = seen.moments
-    found = _information(dataclasses.replace(here, parts=(_with_data(local, design, moments),)), design, seen)
+    found = _information(
+        dataclasses.replace(here, parts=(_with_data(local, design, moments),)), design, seen
+    )
     if design.lengthening is not None:
         found = found + design.lengthening.information(task, coordinates, theta[own])
     whole = np.zeros((len(names), len(names)))
@@ -120,41 +151,72 @@ def design_information(
 
 
 def coordinates_of(like: Part, theta: np.ndarray, task: Any) -> tuple[np.ndarray, Coordinates]:
-    """Which of the fit's coordinates the task has, and these: the same θ stands for the task's own values."""
+    """Which of the fit's coordinates the task has, and these: the same θ stands for the task's own
+    values."""
     c = like.coordinates
-    has = [i for i, n in enumerate(c.names) if n in task.parameter_names and (float(task[n]) > 0 or not c.positive[i])]
+    has = [
+        i
+        for i, n in enumerate(c.names)
+        if n in task.parameter_names and (float(task[n]) > 0 or not c.positive[i])
+    ]
     own, sd, positive = np.array(like.columns, dtype=int)[has], c.sd[has], c.positive[has]
     values, step = np.array([float(task[c.names[i]]) for i in has]), sd * theta[own]
     centre = np.where(positive, values * np.exp(-step), values - step)
     unbounded = np.full(len(own), np.inf)
-    return own, Coordinates(tuple(c.names[i] for i in has), centre, sd, positive, -unbounded, unbounded)
+    return own, Coordinates(
+        tuple(c.names[i] for i in has), centre, sd, positive, -unbounded, unbounded
+    )
 
 
 def _local(like: Part, coordinates: Coordinates, task: Any, design: Design) -> Part:
     """The design's target with its task, without data."""
     present, settings = like.target, task.settings
-    bins = present.bins if settings == present.settings else np.arange(settings.first_bin, settings.last_bin + 1)
+    bins = (
+        present.bins
+        if settings == present.settings
+        else np.arange(settings.first_bin, settings.last_bin + 1)
+    )
     counts = design.counts if design.counts and design.spectral else segments_of(present)
-    target = Target(design.name, np.ones(len(bins)), bins=bins, quantity=task.quantity, segments=counts, settings=settings)
+    target = Target(
+        design.name,
+        np.ones(len(bins)),
+        bins=bins,
+        quantity=task.quantity,
+        segments=counts,
+        settings=settings,
+    )
     return Part("", task, target, coordinates, tuple(range(len(coordinates.names))), None, None)
 
 
 def _with_data(part: Part, design: Design, moments: Moments) -> Part:
     """The part with the data that the design is expected to give."""
     mean, sd = float(moments.mean), float(np.sqrt(moments.variance))
-    if (design.coefficient_of_variation or design.mean is not None) and not sd < MOST_VARIATION * abs(mean):
-        raise ValueError(f"{design.name}: the mean of its output is zero, so neither it nor a coefficient of variation "
-                         "can be stated relatively: leave both out")  # fmt: skip
+    if (
+        design.coefficient_of_variation or design.mean is not None
+    ) and not sd < MOST_VARIATION * abs(mean):
+        raise ValueError(
+            f"{design.name}: the mean of its output is zero, so neither it nor a coefficient of"
+            " variation can be stated relatively: leave both out"
+        )
     old = part.target
     target = Target(
-        design.name, moments.proportional, bins=old.bins, quantity=old.quantity, segments=old.segments,
-        coefficient_of_variation=sd / abs(mean) if design.coefficient_of_variation else None, settings=old.settings,
-    )  # fmt: skip
+        design.name,
+        moments.proportional,
+        bins=old.bins,
+        quantity=old.quantity,
+        segments=old.segments,
+        coefficient_of_variation=sd / abs(mean) if design.coefficient_of_variation else None,
+        settings=old.settings,
+    )
     stated = None if design.mean is None else (mean, design.mean * abs(mean))
-    return dataclasses.replace(part, target=target, variation=target_variation(target, part.task), mean=stated)
+    return dataclasses.replace(
+        part, target=target, variation=target_variation(target, part.task), mean=stated
+    )
 
 
-def _information(problem: FitProblem, design: Design, seen: Expansion) -> Float[np.ndarray, "own own"]:
+def _information(
+    problem: FitProblem, design: Design, seen: Expansion
+) -> Float[np.ndarray, "own own"]:
     likelihood = Likelihood.of(problem)
     (bins,) = likelihood.bins
     assert bins is not None

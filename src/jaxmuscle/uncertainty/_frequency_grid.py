@@ -1,4 +1,5 @@
-"""Grids of a harmonic's frequency, over which a posterior is summed, and the tables of their lines."""
+"""Grids of a harmonic's frequency, over which a posterior is summed, and the tables of their
+lines."""
 
 import equinox as eqx
 import jax
@@ -22,14 +23,16 @@ MODES, FADED = 4, 8.0
 # Standard deviations about a maximum, out to where a wide cell holds next to nothing.
 AROUND = np.array([-5.5, -4.0, -3.0, -2.25, -1.5, -0.75, 0.0, 0.75, 1.5, 2.25, 3.0, 4.0, 5.5])
 FILLED = 16
-UNSEEN = 3e-5  # 1/Hz in any bin of a line of mean square 1: white noise of that mean square has 0.02
+# 1/Hz in any bin of a line of mean square 1: white noise of that mean square has 0.02
+UNSEEN = 3e-5
 
 
 class Band(eqx.Module):
-    """A harmonic frequency that is summed over: its grid f_j, weights w_j (prior density times the width of the cell).
+    """A harmonic frequency that is summed over: its grid f_j, weights w_j (prior density times the
+    width of the cell).
 
-    `parts` are those that it acts on, each with the `tables` of its lines. Their levels end with the last frequency whose
-    line shows in the bins.
+    `parts` are those that it acts on, each with the `tables` of its lines. Their levels end with
+    the last frequency whose line shows in the bins.
     """
 
     frequency: Float[Array | np.ndarray, " grid"]
@@ -40,19 +43,24 @@ class Band(eqx.Module):
 
 
 @kept
-def _tables(settings: SpectrumSettings, frequency: Array | np.ndarray, samples: Array | np.ndarray) -> LineTable:
+def _tables(
+    settings: SpectrumSettings, frequency: Array | np.ndarray, samples: Array | np.ndarray
+) -> LineTable:
     table = jax.vmap(lambda f: line_table(settings, WINDOW, f, samples))(jnp.asarray(frequency))
     return table._replace(level=jnp.moveaxis(table.level, 0, -1))
 
 
 def band_about(problem: FitProblem, peak: Maximum, name: str) -> Band:
-    """The grid of one frequency, and the tables of its lines in the spectra of the parts that it acts on."""
+    """The grid of one frequency, and the tables of its lines in the spectra of the parts that it
+    acts on."""
     column = problem.coordinates.names.index(name)
     acting = [i for i, part in enumerate(problem.parts) if column in part.columns]
     for i in acting:
         if not isinstance(problem.parts[i].task.harmonic.envelope, Constant):
-            raise ValueError(f"{name}: with an envelope that changes its posterior cannot be summed over a grid: fix it "
-                             f"(free= without {name})")  # fmt: skip
+            raise ValueError(
+                f"{name}: with an envelope that changes its posterior cannot be summed over a grid:"
+                f" fix it (free= without {name})"
+            )
     frequency = _grid(problem, peak, name)
     tables = []
     for part in (problem.parts[i] for i in acting):
@@ -60,14 +68,18 @@ def band_about(problem: FitProblem, peak: Maximum, name: str) -> Band:
         # A third of the time in single precision; 1e-5 in a log density moves no draw.
         precision = np.float64 if part.target.segments is None else np.float32
         level = np.asarray(table.level[:, part.chosen], precision)
-        seen = 2 * level[0].max(axis=0, initial=0.0) > UNSEEN * np.asarray(table.passed)  # nowhere in a part without bins
+        # nowhere in a part without bins
+        seen = 2 * level[0].max(axis=0, initial=0.0) > UNSEEN * np.asarray(table.passed)
         level = level[..., : FILLED * (1 + int(np.max(np.flatnonzero(seen), initial=0)) // FILLED)]
         tables.append(jax.tree.map(np.asarray, table)._replace(level=level))
-    return Band(frequency, _log_weight(problem, frequency, name), tuple(tables), name, tuple(acting))
+    return Band(
+        frequency, _log_weight(problem, frequency, name), tuple(tables), name, tuple(acting)
+    )
 
 
 def _grid(problem: FitProblem, peak: Maximum, name: str) -> Float[np.ndarray, " grid"]:
-    """Frequencies three to a bin over the band, fewer beyond it, and close about every maximum that counts.
+    """Frequencies three to a bin over the band, fewer beyond it, and close about every maximum that
+    counts.
 
     The last is repeated, so that few sizes are compiled.
     """
@@ -77,7 +89,11 @@ def _grid(problem: FitProblem, peak: Maximum, name: str) -> Float[np.ndarray, " 
     low, high = c.centre[column] * np.exp(c.sd[column] * theta)
     high = min(high, HIGHEST * min(target.settings.rate for target in targets))
     edge = max(target.frequency[-1] for target in targets) + 2 * width
-    parts = [np.arange(low, min(edge, high), width / PER_BIN), np.arange(edge, high, BEYOND * width), [high]]
+    parts = [
+        np.arange(low, min(edge, high), width / PER_BIN),
+        np.arange(edge, high, BEYOND * width),
+        [high],
+    ]
     for i in distinct(problem, peak.cost, peak.theta, 0.5 * width, FADED, MODES, [name]):
         f = float(c.centre[column] * np.exp(c.sd[column] * peak.theta[i, column]))
         sd = f * c.sd[column] * np.sqrt(peak.covariance(i)[column, column])
@@ -93,9 +109,15 @@ def edges_of(frequency: Float[np.ndarray, " grid"]) -> Float[np.ndarray, " edges
     return np.concatenate([frequency[:1], 0.5 * (frequency[1:] + frequency[:-1]), frequency[-1:]])
 
 
-def _log_weight(problem: FitProblem, frequency: Float[np.ndarray, " grid"], name: str) -> Float[np.ndarray, " grid"]:
+def _log_weight(
+    problem: FitProblem, frequency: Float[np.ndarray, " grid"], name: str
+) -> Float[np.ndarray, " grid"]:
     """Prior density of every frequency times the width of its cell."""
     column = problem.coordinates.names.index(name)
     theta = problem.coordinates.theta_of(name, frequency)
     with np.errstate(divide="ignore"):  # what is repeated has no width
-        return -0.5 * problem.prior[column] * theta**2 - np.log(frequency) + np.log(np.diff(edges_of(frequency)))
+        return (
+            -0.5 * problem.prior[column] * theta**2
+            - np.log(frequency)
+            + np.log(np.diff(edges_of(frequency)))
+        )

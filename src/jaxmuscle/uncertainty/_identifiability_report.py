@@ -1,4 +1,5 @@
-"""The identifiability report: what is known now, what it would be with further measurements, in words and tables."""
+"""The identifiability report: what is known now, what it would be with further measurements, in
+words and tables."""
 
 import textwrap
 from collections.abc import Iterable
@@ -28,13 +29,19 @@ PAIRS_TOLD = 3
 TOGETHER = " together with "
 SAME = 1e-6
 FAR = 999  # percent
-STRICTER = "The fit is stricter: it also looks for other solutions, and at combinations that are open. Believe the fit"
-TIRING = (
-    "fatigue is not considered: split a long or strong hold into short trials with rests between, and give all trials "
-    "to one fit"
+STRICTER = (
+    "The fit is stricter: it also looks for other solutions, and at combinations that are open."
+    " Believe the fit"
 )
-NO_NOISE = ("no further measurement is tried: the fit has no spectrum, so the noise that limits a measurement is not known. "
-            "Fit the recording of both channels, or a spectrum beside the response (fit_joint)")  # fmt: skip
+TIRING = (
+    "fatigue is not considered: split a long or strong hold into short trials with rests between,"
+    " and give all trials to one fit"
+)
+NO_NOISE = (
+    "no further measurement is tried: the fit has no spectrum, so the noise that limits a"
+    " measurement is not known. Fit the recording of both channels, or a spectrum beside the"
+    " response (fit_joint)"
+)
 FITTED_TOO = "fitted in this measurement"
 DOUBTED = "; in the column now also what the fit does not call determined"
 OPENED = "; but fitted in those measurements whose details say so"
@@ -42,7 +49,8 @@ BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
 
 
 class Known(eqx.Module):
-    """How well a quantity is known: `stderr` by data and prior, `prior_sd` by the prior alone, both to first order.
+    """How well a quantity is known: `stderr` by data and prior, `prior_sd` by the prior alone, both
+    to first order.
 
     `determined` if the data leave at most a tenth of the prior's variance.
     """
@@ -60,12 +68,19 @@ class Known(eqx.Module):
 
     def row(self) -> dict[str, Any]:
         """As columns of a table."""
-        return {"value": self.value, "unit": self.unit, "stderr": self.stderr, "prior_sd": self.prior_sd, "left": self.left,
-                "determined": self.determined}  # fmt: skip
+        return {
+            "value": self.value,
+            "unit": self.unit,
+            "stderr": self.stderr,
+            "prior_sd": self.prior_sd,
+            "left": self.left,
+            "determined": self.determined,
+        }
 
     @property
     def percent(self) -> str:
-        """The standard error in percent of the value, or in its unit where the value has either sign."""
+        """The standard error in percent of the value, or in its unit where the value has either
+        sign."""
         if self.value > 0 and self.unit not in ("m", "rad"):
             return f"{100 * self.stderr / self.value:.2g} %"
         return f"{self.stderr:.2g} {self.unit}"
@@ -74,13 +89,15 @@ class Known(eqx.Module):
 class Outlook(Printed, Result, eqx.Module):
     """What is known with the data of a design, or of several, added to the present ones.
 
-    `task` and `data` in words; `separate`, the parameters that have other values there; `singular_values`: by how
-    many of their standard errors the data move if the parameters change by a standard deviation of the prior along each
-    direction; `determined`, how many directions are (singular value at least 3); `undetermined`, sentences: what can be
-    scaled together unnoticed; `products` and ratios of parameters that are determined, with their relative standard errors;
-    `quantities` by name, each with `value`, `unit`, `stderr` by data and prior, `prior_sd` by the prior alone, and whether
-    it is `determined` (at most a tenth of the prior's variance is left); `gained`, those that become determined; `failed`,
-    why the design is impossible, or None. An impossible design adds nothing: its numbers are those of the present data.
+    `task` and `data` in words; `separate`, the parameters that have other values there;
+    `singular_values`: by how many of their standard errors the data move if the parameters change
+    by a standard deviation of the prior along each direction; `determined`, how many directions are
+    (singular value at least 3); `undetermined`, sentences: what can be scaled together unnoticed;
+    `products` and ratios of parameters that are determined, with their relative standard errors;
+    `quantities` by name, each with `value`, `unit`, `stderr` by data and prior, `prior_sd` by the
+    prior alone, and whether it is `determined` (at most a tenth of the prior's variance is left);
+    `gained`, those that become determined; `failed`, why the design is impossible, or None. An
+    impossible design adds nothing: its numbers are those of the present data.
     """
 
     name: str
@@ -97,13 +114,16 @@ class Outlook(Printed, Result, eqx.Module):
 
     @property
     def log_left(self) -> float:
-        """Sum over all quantities of the logarithm of what is left of the prior's error: the lower, the more is known."""
+        """Sum over all quantities of the logarithm of what is left of the prior's error: the lower,
+        the more is known."""
         return float(sum(np.log(known.left) for known in self.quantities.values()))
 
     def __str__(self) -> str:
         if self.failed is not None:
             return f"{self.name} is impossible: {self.failed}"
-        names = sorted(set(self.gained) & set(told(self.quantities)), key=lambda n: self.quantities[n].left)
+        names = sorted(
+            set(self.gained) & set(told(self.quantities)), key=lambda n: self.quantities[n].left
+        )
         if not names:
             return f"{self.name} would determine no further quantity"
         parts = [f"{n} to {self.quantities[n].percent}" for n in names]
@@ -113,23 +133,32 @@ class Outlook(Printed, Result, eqx.Module):
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings."""
         return {
-            "name": self.name, "task": self.task, "data": self.data, "separate": list(self.separate),
-            "failed": self.failed, "singular_values": self.singular_values.tolist(), "determined": self.determined,
-            "undetermined": list(self.undetermined), "products": self.products, "gained": list(self.gained),
+            "name": self.name,
+            "task": self.task,
+            "data": self.data,
+            "separate": list(self.separate),
+            "failed": self.failed,
+            "singular_values": self.singular_values.tolist(),
+            "determined": self.determined,
+            "undetermined": list(self.undetermined),
+            "products": self.products,
+            "gained": list(self.gained),
             "quantities": {n: k.row() for n, k in self.quantities.items()},
-        }  # fmt: skip
+        }
 
 
 UNDESCRIBED = "the fit does not describe its data"
 
 
 class IdentifiabilityReport(Printed, Result, eqx.Module):
-    """What the data of a fit determine (`present`), and what they would with further `designs` or `pairs` of these.
+    """What the data of a fit determine (`present`), and what they would with further `designs` or
+    `pairs` of these.
 
-    `target` and `free` name the data and the fitted parameters; the pairs are sorted, best first; `notices` of the fit;
-    `mean_force` [N] of the fitted muscle where the data have no newtons: print states values per newton of it, as the fit
-    does, and `to_dict` in newtons; `open_in_fit`, what is determined here and was not in the fit, which is stricter;
-    `masses` [kg] that are taken as known.
+    `target` and `free` name the data and the fitted parameters; the pairs are sorted, best first;
+    `notices` of the fit; `mean_force` [N] of the fitted muscle where the data have no newtons:
+    print states values per newton of it, as the fit does, and `to_dict` in newtons; `open_in_fit`,
+    what is determined here and was not in the fit, which is stricter; `masses` [kg] that are taken
+    as known.
     """
 
     target: str
@@ -144,7 +173,8 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
 
     @property
     def telling_pairs(self) -> tuple[Outlook, ...]:
-        """Pairs after which more quantities become determined than after any single design, best first."""
+        """Pairs after which more quantities become determined than after any single design, best
+        first."""
         most = max((len(design.gained) for design in self.designs), default=0)
         return tuple(pair for pair in self.pairs if len(pair.gained) > most)
 
@@ -159,7 +189,11 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
     @property
     def doubt(self) -> str:
         """What stands in red above the figure: nothing, or that the fit misses its data."""
-        return "The fit does not describe its data" if any(n.startswith(UNDESCRIBED) for n in self.notices) else ""
+        return (
+            "The fit does not describe its data"
+            if any(n.startswith(UNDESCRIBED) for n in self.notices)
+            else ""
+        )
 
     @property
     def told(self) -> list[str]:
@@ -169,20 +203,32 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings."""
         return {
-            "format": 1, "target": self.target, "free": list(self.free), "threshold": DETERMINED,
-            "present": self.present.to_dict(), "designs": [d.to_dict() for d in self.designs],
-            "pairs": [d.to_dict() for d in self.pairs], "notices": list(self.notices),
-            "not_determined_in_fit": list(self.open_in_fit), "masses": self.masses,
-        }  # fmt: skip
+            "format": 1,
+            "target": self.target,
+            "free": list(self.free),
+            "threshold": DETERMINED,
+            "present": self.present.to_dict(),
+            "designs": [d.to_dict() for d in self.designs],
+            "pairs": [d.to_dict() for d in self.pairs],
+            "notices": list(self.notices),
+            "not_determined_in_fit": list(self.open_in_fit),
+            "masses": self.masses,
+        }
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row for each design ("" is the present data) and quantity.
 
-        Columns: `design`, `quantity`, `value`, `unit`, `stderr`, `prior_sd`, the share `left` of it, `determined`.
+        Columns: `design`, `quantity`, `value`, `unit`, `stderr`, `prior_sd`, the share `left` of
+        it, `determined`.
         """
         known = {"": self.present, **{o.name: o for o in (*self.designs, *self.pairs)}}
-        return frame([{"design": design, "quantity": name, **quantity.row()}
-                      for design, outlook in known.items() for name, quantity in outlook.quantities.items()])  # fmt: skip
+        return frame(
+            [
+                {"design": design, "quantity": name, **quantity.row()}
+                for design, outlook in known.items()
+                for name, quantity in outlook.quantities.items()
+            ]
+        )
 
     def save(self, path: str | Path) -> None:
         """Write `to_dict` as JSON, atomically."""
@@ -197,12 +243,17 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
 
 
 def told(quantities: dict[str, Known]) -> list[str]:
-    """The quantities to be told of: K_j0 and C_j0 stand for the k_j and c_j to which they are proportional.
+    """The quantities to be told of: K_j0 and C_j0 stand for the k_j and c_j to which they are
+    proportional.
 
     What has two names, as the tremor's frequency, is told by the one that people use.
     """
-    twins = {k: base for k, base in (BASE | ALIASES).items() if k in quantities and base in quantities}
-    doubled = {k for k, base in twins.items() if abs(quantities[k].left - quantities[base].left) < SAME}
+    twins = {
+        k: base for k, base in (BASE | ALIASES).items() if k in quantities and base in quantities
+    }
+    doubled = {
+        k for k, base in twins.items() if abs(quantities[k].left - quantities[base].left) < SAME
+    }
     return [name for name in quantities if name not in doubled]
 
 
@@ -213,8 +264,14 @@ def letter(number: int) -> str:
 
 def _wrapped(text: str, indent: int, first: str | None = None) -> list[str]:
     start = " " * indent if first is None else first
-    return textwrap.wrap(text, WIDTH, initial_indent=start, subsequent_indent=" " * max(indent, len(start)),
-                         break_long_words=False, break_on_hyphens=False)  # fmt: skip
+    return textwrap.wrap(
+        text,
+        WIDTH,
+        initial_indent=start,
+        subsequent_indent=" " * max(indent, len(start)),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def _present(report: IdentifiabilityReport) -> list[str]:
@@ -223,14 +280,24 @@ def _present(report: IdentifiabilityReport) -> list[str]:
     lines += _wrapped(f"{now.task}; {now.data}", 2)
     for notice in report.notices:
         lines += _wrapped(notice, 4, "  note: ")
-    lines += _wrapped(f"{now.determined} of {len(report.free)} combinations of the parameters are determined: those left "
-                      f"of the bar, with a singular value of {DETERMINED:g} or more", 4, "  ")  # fmt: skip
+    lines += _wrapped(
+        f"{now.determined} of {len(report.free)} combinations of the parameters are determined:"
+        f" those left of the bar, with a singular value of {DETERMINED:g} or more",
+        4,
+        "  ",
+    )
     values = [f"{v:.3g}" for v in now.singular_values]
     lines += _wrapped("  ".join([*values[: now.determined], "|", *values[now.determined :]]), 4)
     if now.products:
-        lines += _wrapped(f"determined parameters, products and ratios, with standard errors: {_products(now)}", 4, "  ")
+        lines += _wrapped(
+            f"determined parameters, products and ratios, with standard errors: {_products(now)}",
+            4,
+            "  ",
+        )
     if doubted := [name for name in told(now.quantities) if name in report.open_in_fit]:
-        lines += _wrapped(f"known here, but not determined in the fit: {', '.join(doubted)}. {STRICTER}", 4, "  ")
+        lines += _wrapped(
+            f"known here, but not determined in the fit: {', '.join(doubted)}. {STRICTER}", 4, "  "
+        )
     if now.undetermined:
         lines += ["  the data leave open:"]
         for sentence in now.undetermined:
@@ -239,7 +306,9 @@ def _present(report: IdentifiabilityReport) -> list[str]:
 
 
 def _products(outlook: Outlook) -> str:
-    return ", ".join(f"{as_people_say(name)} (± {100 * error:.2g} %)" for name, error in outlook.products.items())
+    return ", ".join(
+        f"{as_people_say(name)} (± {100 * error:.2g} %)" for name, error in outlook.products.items()
+    )
 
 
 def _next(report: IdentifiabilityReport) -> list[str]:
@@ -250,12 +319,23 @@ def _next(report: IdentifiabilityReport) -> list[str]:
     lines = ["  what to measure next:"]
     if (best := _most(report, (*report.designs, *report.pairs))) is not None:
         count = free - best.determined
-        rest = f"{count} of {free} combinations would stay open" if count else "nothing would stay open"
+        rest = (
+            f"{count} of {free} combinations would stay open"
+            if count
+            else "nothing would stay open"
+        )
         letters = _letters(report, best)
         if len(letters) > 1 and (single := _most(report, report.designs)) is not None:
-            rest += f". If you make only one: {_letters(report, single)[0]} ({free - single.determined} would stay open)"
+            rest += (
+                f". If you make only one: {_letters(report, single)[0]} ({free - single.determined}"
+                " would stay open)"
+            )
         both = zip(letters, best.name.split(TOGETHER), strict=False)
-        what = f"{letters[0]}, {best.name}" if len(letters) == 1 else TOGETHER.join(f"{at} ({name})" for at, name in both)
+        what = (
+            f"{letters[0]}, {best.name}"
+            if len(letters) == 1
+            else TOGETHER.join(f"{at} ({name})" for at, name in both)
+        )
         lines += _wrapped(f"most would be learnt from {what}: {rest}", 4)
     for number, design in enumerate(report.designs):
         count = "" if design.failed else f" ({design.determined} of {free} combinations determined)"
@@ -269,7 +349,9 @@ def _next(report: IdentifiabilityReport) -> list[str]:
 def _letters(report: IdentifiabilityReport, outlook: Outlook) -> list[str]:
     """The letters of a design, or of the two of a pair."""
     alone = [letter(i) for i, design in enumerate(report.designs) if design.name == outlook.name]
-    return alone or [letter(i) for i, d in enumerate(report.designs) if d.name in outlook.name.split(TOGETHER)]
+    return alone or [
+        letter(i) for i, d in enumerate(report.designs) if d.name in outlook.name.split(TOGETHER)
+    ]
 
 
 def _details(report: IdentifiabilityReport) -> list[str]:
@@ -283,17 +365,29 @@ def _details(report: IdentifiabilityReport) -> list[str]:
 
 
 def _table(report: IdentifiabilityReport) -> list[str]:
-    """Standard errors of every quantity by the prior, now, and with each design; those of open quantities in brackets."""
+    """Standard errors of every quantity by the prior, now, and with each design; those of open
+    quantities in brackets."""
     names = told(report.present.quantities)
     possible = [(letter(i), d) for i, d in enumerate(report.designs) if d.failed is None]
     wide = max(24, *(1 + len(name) for name in names))
-    doubted, added = DOUBTED * bool(report.open_in_fit), ". A, B, ...: with that measurement added" * bool(possible)
-    lines = _wrapped("standard errors in percent of the value. In brackets: not determined, since about a third or more of "
-                     f"the error without data is left{doubted}. >>: {FAR} % or more. prior: without data. now: with the "
-                     f"data of the fit{added}", 4, "  ")  # fmt: skip
+    doubted, added = (
+        DOUBTED * bool(report.open_in_fit),
+        ". A, B, ...: with that measurement added" * bool(possible),
+    )
+    lines = _wrapped(
+        "standard errors in percent of the value. In brackets: not determined, since about a third"
+        f" or more of the error without data is left{doubted}. >>: {FAR} % or more. prior: without"
+        f" data. now: with the data of the fit{added}",
+        4,
+        "  ",
+    )
     if report.mean_force is not None:
-        lines += _wrapped("no mean force in newtons was given: forces, stiffness and damping are stated per newton of mean "
-                          f"force (that of the fitted muscle is {report.mean_force:.3g} N)", 4, "  ")  # fmt: skip
+        lines += _wrapped(
+            "no mean force in newtons was given: forces, stiffness and damping are stated per"
+            f" newton of mean force (that of the fitted muscle is {report.mean_force:.3g} N)",
+            4,
+            "  ",
+        )
     elif report.masses:
         known = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
         opened = OPENED * any(FITTED_TOO in outlook.data for outlook in report.designs)
@@ -301,13 +395,21 @@ def _table(report: IdentifiabilityReport) -> list[str]:
     for start in range(0, max(len(possible), 1), COLUMNS):
         block = possible[start : start + COLUMNS]
         heads = ["prior", "now", *(label for label, _ in block)]
-        lines.append(f"  {'':<{wide}}{'value':>9} {'unit':<5}" + "".join(f"{head:>6}" for head in heads))
+        lines.append(
+            f"  {'':<{wide}}{'value':>9} {'unit':<5}" + "".join(f"{head:>6}" for head in heads)
+        )
         for name in names:
             now = report.present.quantities[name]
             here = f"({_cell(now, now.stderr)})" if name in report.open_in_fit else _shown(now)
-            cells = [f"({_cell(now, now.prior_sd)})", here, *(_shown(d.quantities[name]) for _, d in block)]
+            cells = [
+                f"({_cell(now, now.prior_sd)})",
+                here,
+                *(_shown(d.quantities[name]) for _, d in block),
+            ]
             value, unit = _stated(now, None if name == "mean" else report.mean_force)
-            lines.append(f"  {name:<{wide}}{value:>9.3g} {unit:<5}" + "".join(f"{cell:>6}" for cell in cells))
+            lines.append(
+                f"  {name:<{wide}}{value:>9.3g} {unit:<5}" + "".join(f"{cell:>6}" for cell in cells)
+            )
     return lines
 
 
@@ -330,7 +432,12 @@ def _cell(known: Known, error: float) -> str:
 
 
 def _most(report: IdentifiabilityReport, outlooks: Iterable[Outlook]) -> Outlook | None:
-    """What determines most; among equals one measurement before two, then that with the smaller errors."""
+    """What determines most; among equals one measurement before two, then that with the smaller
+    errors."""
     alone = {design.name for design in report.designs}
     possible = [outlook for outlook in outlooks if outlook.failed is None]
-    return max(possible, key=lambda o: (o.determined, len(o.gained), o.name in alone, -o.log_left), default=None)
+    return max(
+        possible,
+        key=lambda o: (o.determined, len(o.gained), o.name in alone, -o.log_left),
+        default=None,
+    )

@@ -22,7 +22,13 @@ from jaxmuscle.objective._derived import TANGENTS, derived_names, has_tangents
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.response._expected_spectrum import expected_spectrum
 
-from ._design_information import coordinates_of, design_information, opened, prior_beside_a_motion, seen_here
+from ._design_information import (
+    coordinates_of,
+    design_information,
+    opened,
+    prior_beside_a_motion,
+    seen_here,
+)
 from ._designed_input import DOUBTFUL, DesignedInput
 from ._designs import moved_insertion, without_noise
 from ._identifiability import LEAST_PRIOR, Here, fitted_problem, missed
@@ -61,63 +67,87 @@ def design_input(
 
         made = jm.design_input(result, "K_w0", rms=1e-3, band=(0.5, 5.0))
 
-    The density S_x(f) of the displacement that minimises the sum of the relative variances of the quantities q,
+    The density S_x(f) of the displacement that minimises the sum of the relative variances of the
+    quantities q,
 
-        Σ_q g_qᵀ (I_0 + I[S_x])⁻¹ g_q / q²,    I[S_x] = 2T ∫ Re(∂H* ∂Hᵀ) S_x(f) / S(f) df,    ∫ S_x df <= rms²
+        Σ_q g_qᵀ (I_0 + I[S_x])⁻¹ g_q / q²
+        I[S_x] = 2T ∫ Re(∂H* ∂Hᵀ) S_x(f) / S(f) df,    ∫ S_x df <= rms²
 
-    I_0 is the information that is there without the motion: the fit's data and prior, and the fluctuations of the new
-    record. The masses are fitted with the record: their errors are in those of q. H is the `dynamic_stiffness`, S the
-    `noise_density`, T the length of the record. The problem is convex. S_x is constant in steps 0.15 f wide, or of five
-    lines. It is then realised as a multisine, periodic in T, with phases that keep the peaks low. Everything reported is
-    of this motion.
+    I_0 is the information that is there without the motion: the fit's data and prior, and the
+    fluctuations of the new record. The masses are fitted with the record: their errors are in those
+    of q. H is the `dynamic_stiffness`, S the `noise_density`, T the length of the record. The
+    problem is convex. S_x is constant in steps 0.15 f wide, or of five lines. It is then realised
+    as a multisine, periodic in T, with phases that keep the peaks low. Everything reported is of
+    this motion.
 
     **Arguments:**
 
     - `result` of a fit, or a task, whose usual free parameters are then free with their prior
-    - `quantity`: a free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, K_w_tangent, or several. In a fit of
-      several targets write "K_w_tangent@NAME" for that of one. Without "@NAME" it is that of `target`, if you give one;
-      otherwise that of the first target that has a dynamic stiffness, or of the first of all if none has
-    - `rms` [m], `peak` [m], `speed` [m/s], `acceleration` [m/s²]: at most; where the motion would pass `peak`, `speed` or
-      `acceleration` it gets smaller or slower
+    - `quantity`: a free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0,
+      K_w_tangent, or several. In a fit of several targets write "K_w_tangent@NAME" for that of one.
+      Without "@NAME" it is that of `target`, if you give one; otherwise that of the first target
+      that has a dynamic stiffness, or of the first of all if none has
+    - `rms` [m], `peak` [m], `speed` [m/s], `acceleration` [m/s²]: at most; where the motion would
+      pass `peak`, `speed` or `acceleration` it gets smaller or slower
     - `band` [Hz]: from 0.5 Hz on, as drift and slow movements of the person are not in the model
     - `seconds`: length of the record and period
     - `rate` [Hz] of the motion
     - `key` of its phases
-    - `spread`: the share of the mean square that is even over the band (a motion of few lines could be foreseen, and would
-      not test the model)
-    - `target`: of a fit with several targets, the one whose task and spectrum settings the new record takes over (by
-      default the first)
-    - `durations` [s]: lengths of the record for which the errors are told, too, the motion being repeated
+    - `spread`: the share of the mean square that is even over the band (a motion of few lines could
+      be foreseen, and would not test the model)
+    - `target`: of a fit with several targets, the one whose task and spectrum settings the new
+      record takes over (by default the first)
+    - `durations` [s]: lengths of the record for which the errors are told, too, the motion being
+      repeated
     - `error`: relative, 0.1 say: how long a record takes until every quantity is known to that
 
-    **Raises:** `ValueError` for an unknown quantity or one that is fixed, or of which no motion tells; for limits that are
-    not positive, a band that holds no line or reaches beyond half the rate, seconds that are no whole number of samples;
-    `OperatingPointError` for a task without linear response.
+    **Raises:** `ValueError` for an unknown quantity or one that is fixed, or of which no motion
+    tells; for limits that are not positive, a band that holds no line or reaches beyond half the
+    rate, seconds that are no whole number of samples; `OperatingPointError` for a task without
+    linear response.
     """
-    for name, value, unit in (("rms", rms, "m"), ("peak", peak, "m"), ("speed", speed, "m/s"),
-                              ("acceleration", acceleration, "m/s²"), ("rate", rate, "Hz")):  # fmt: skip
+    for name, value, unit in (
+        ("rms", rms, "m"),
+        ("peak", peak, "m"),
+        ("speed", speed, "m/s"),
+        ("acceleration", acceleration, "m/s²"),
+        ("rate", rate, "Hz"),
+    ):
         require_positive(name, np.float64(1.0) if value is None else value, unit)
     require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
     durations = [float(one) for one in durations]
     require(
-        seconds >= LEAST_SECONDS, f"seconds = {seconds}: give at least {LEAST_SECONDS:g} s, since less holds no spectrum"
+        seconds >= LEAST_SECONDS,
+        f"seconds = {seconds}: give at least {LEAST_SECONDS:g} s, since less holds no spectrum",
     )
     for one in durations:
         require_positive("durations", one, "s")
-    require(error is None or 0 < error < 1, f"error = {error} must be a share between 0 and 1, 0.1 for 10 %")
+    require(
+        error is None or 0 < error < 1,
+        f"error = {error} must be a share between 0 and 1, 0.1 for 10 %",
+    )
     check_key(key)
-    require(seconds * rate <= MOST, f"seconds = {seconds} at rate = {rate} Hz are more than {MOST} samples: make it shorter")
+    require(
+        seconds * rate <= MOST,
+        f"seconds = {seconds} at rate = {rate} Hz are more than {MOST} samples: make it shorter",
+    )
     frequency, samples = lines_in(band, seconds), round(seconds * rate)
-    require(abs(samples - seconds * rate) < ENOUGH * samples,
-            f"seconds = {seconds}: rate = {rate} Hz makes no whole number of samples of it")  # fmt: skip
-    require(2 * frequency[-1] < rate, f"band = {band} Hz reaches beyond half of rate = {rate} Hz: raise the rate")
+    require(
+        abs(samples - seconds * rate) < ENOUGH * samples,
+        f"seconds = {seconds}: rate = {rate} Hz makes no whole number of samples of it",
+    )
+    require(
+        2 * frequency[-1] < rate,
+        f"band = {band} Hz reaches beyond half of rate = {rate} Hz: raise the rate",
+    )
     quantities = (quantity,) if isinstance(quantity, str) else tuple(quantity)
     limits = np.array([np.inf if limit is None else limit for limit in (peak, speed, acceleration)])
     crest = np.array(CREST)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_of(key))).tolist())
 
     def realised(power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A motion of these lines, made smaller where it must be, and the crest factors of it and its derivatives."""
+        """A motion of these lines, made smaller where it must be, and the crest factors of it and
+        its derivatives."""
         motion = multisine(frequency * seconds, power, seconds, samples, limits, rng)
         velocity = speed_of(motion, seconds)
         moved = np.stack([motion, velocity, speed_of(velocity, seconds)])
@@ -132,33 +162,77 @@ def design_input(
         for _ in range(TRIES if np.isfinite(min(limits)) else 1):
             allowed = np.minimum(limits / crest, [rms, np.inf, np.inf])
             motion, crest = realised(experiment.best(allowed, spread))
-        wide = Lengthening.flat(rms, (band[0], 2 * band[1]), seconds) if 4 * band[1] < rate else None
-        wider = None if wide is None else (2.0 * band[1], experiment.errors_of(wide.within(limits / crest)))
+        wide = (
+            Lengthening.flat(rms, (band[0], 2 * band[1]), seconds) if 4 * band[1] < rate else None
+        )
+        wider = (
+            None
+            if wide is None
+            else (2.0 * band[1], experiment.errors_of(wide.within(limits / crest)))
+        )
     own, quantities = even.of_motion(motion), experiment.quantity
     known = experiment.here.values
-    values, units = {n: value for n, (value, _) in known.items()}, {n: unit for n, (_, unit) in known.items()}
+    values, units = (
+        {n: value for n, (value, _) in known.items()},
+        {n: unit for n, (_, unit) in known.items()},
+    )
     now, flat, best = (experiment.errors(p) for p in (None, even.power, own.power))
     longer = {one: experiment.errors(own.power, one / seconds) for one in durations}
-    needed = None if error is None else (float(error), seconds * experiment.times_for(own.power, error))
+    needed = (
+        None if error is None else (float(error), seconds * experiment.times_for(own.power, error))
+    )
     vague = [n for n in quantities if now[n] > DOUBTFUL * abs(values[n])]
     with jax.enable_x64(True):
-        others = {n: tuple(_elsewhere(result, n, even, target, own.power, side * experiment.towards(n)) for side in (-1, 1))
-                  for n in vague}  # fmt: skip
+        others = {
+            n: tuple(
+                _elsewhere(result, n, even, target, own.power, side * experiment.towards(n))
+                for side in (-1, 1)
+            )
+            for n in vague
+        }
     notices = missed(result) if isinstance(result, FitResult) else ()
-    return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed, notices,
-                         others, experiment.masses, experiment.held, experiment.by_prior(), wider,
-                         experiment.moved, (rms, *limits.tolist()))  # fmt: skip
+    return DesignedInput(
+        quantities,
+        own,
+        even,
+        motion,
+        float(rate),
+        values,
+        units,
+        now,
+        flat,
+        best,
+        longer,
+        needed,
+        notices,
+        others,
+        experiment.masses,
+        experiment.held,
+        experiment.by_prior(),
+        wider,
+        experiment.moved,
+        (rms, *limits.tolist()),
+    )
 
 
 def _named(name: str, known: Mapping[str, Any], targets: Iterable[str | None]) -> str:
-    """A quantity by the name that it has in a fit of several targets, of the first that has it: "K_w_tangent@moved"."""
-    return next((n for n in (name, *(f"{name}@{target}" for target in targets)) if n in known), name)
+    """A quantity by the name that it has in a fit of several targets, of the first that has it:
+    "K_w_tangent@moved"."""
+    return next(
+        (n for n in (name, *(f"{name}@{target}" for target in targets)) if n in known), name
+    )
 
 
 def _elsewhere(
-    given: FitResult | AbstractTask, name: str, record: Lengthening, target: str | None, power: np.ndarray, step: np.ndarray
+    given: FitResult | AbstractTask,
+    name: str,
+    record: Lengthening,
+    target: str | None,
+    power: np.ndarray,
+    step: np.ndarray,
 ) -> tuple[float, float]:
-    """A quantity's value a step away from the fit, and the standard error there with a motion; nan where no muscle is."""
+    """A quantity's value a step away from the fit, and the standard error there with a motion; nan
+    where no muscle is."""
     try:
         there = Experiment.of(given, (name,), record, target, step)
     except OperatingPointError:
@@ -167,8 +241,8 @@ def _elsewhere(
 
 
 class Experiment(NamedTuple):
-    """What is known without the motion: by the `prior`, `start` of it and all data, information `apart` from the response;
-    that of its lines."""
+    """What is known without the motion: by the `prior`, `start` of it and all data, information
+    `apart` from the response; that of its lines."""
 
     here: Here
     quantity: tuple[str, ...]
@@ -191,7 +265,8 @@ class Experiment(NamedTuple):
         target: str | None,
         step: Float[np.ndarray, " free"] | None = None,
     ) -> "Experiment":
-        """Of a record, at the values of a fit or task, or a step of its θ away from them. Needs double precision."""
+        """Of a record, at the values of a fit or task, or a step of its θ away from them. Needs
+        double precision."""
         fitted, theta, derived = _problem(given)
         if without_noise(fitted):
             raise ValueError(f"result: {NO_NOISE}")
@@ -202,7 +277,9 @@ class Experiment(NamedTuple):
             theta = theta + step
             parts = (dataclasses.replace(part, task=part.task_at(theta)) for part in problem.parts)
             problem = dataclasses.replace(problem, parts=tuple(parts))
-        told = problem.by_name([dict.fromkeys(TANGENTS if has_tangents(part.task) else ()) for part in problem.parts])
+        told = problem.by_name(
+            [dict.fromkeys(TANGENTS if has_tangents(part.task) else ()) for part in problem.parts]
+        )
         here = Here.of(problem, seen_here(problem, theta), dict.fromkeys([*derived, *told]))
         moved = [part.name for part in fitted.parts if part.target.stiffness is not None]
         targets = [target, *moved, *(part.name for part in fitted.parts)]
@@ -211,22 +288,36 @@ class Experiment(NamedTuple):
             if name not in here.gradients:
                 base = name.partition("@")[0]
                 if base in TANGENTS:
-                    raise ValueError(f"quantity {name!r}: fits of a held or a moved insertion have it (Isometric, "
-                                     "PrescribedLength, with the paper's muscle)")  # fmt: skip
+                    raise ValueError(
+                        f"quantity {name!r}: fits of a held or a moved insertion have it"
+                        " (Isometric, PrescribedLength, with the paper's muscle)"
+                    )
                 fixed = base in (*problem.parts[0].task.parameter_names, *BASE.values())
-                raise ValueError(f"quantity {name!r} " + ("is fixed: leave its parameter free" if fixed else
-                                 f"is unknown: {choices(name, here.gradients)}"))  # fmt: skip
-        design = moved_insertion(record, problem.parts[0].target.settings, coefficient_of_variation=True, target=target)
+                raise ValueError(
+                    f"quantity {name!r} "
+                    + (
+                        "is fixed: leave its parameter free"
+                        if fixed
+                        else f"is unknown: {choices(name, here.gradients)}"
+                    )
+                )
+        design = moved_insertion(
+            record, problem.parts[0].target.settings, coefficient_of_variation=True, target=target
+        )
         like = design.like(problem)
         task: Any = _moved(like.task).with_parts(settings=like.target.settings)
         prior = prior_beside_a_motion(problem)
         start = np.diag(prior) + (here.information if isinstance(given, FitResult) else 0.0)
-        apart = start + design_information(problem, theta, dataclasses.replace(design, task=task, lengthening=None))
+        apart = start + design_information(
+            problem, theta, dataclasses.replace(design, task=task, lengthening=None)
+        )
         own, coordinates = coordinates_of(like, theta, task)
 
         def informed(record: Lengthening) -> np.ndarray:
             lines = np.zeros((len(record.frequency), *start.shape))
-            found = information_of_lines(task, coordinates, theta[own], record.frequency, record.seconds)
+            found = information_of_lines(
+                task, coordinates, theta[own], record.frequency, record.seconds
+            )
             lines[:, own[:, None], own] = found
             return lines
 
@@ -234,7 +325,17 @@ class Experiment(NamedTuple):
         masses = {name: float(task[name]) for name in unfitted if name in task.parameter_names}
         held = tuple(name for name in masses if name not in coordinates.names)
         return cls(
-            here, quantity, masses, held, prior, start, apart, record.frequency, informed, informed(record), bool(moved)
+            here,
+            quantity,
+            masses,
+            held,
+            prior,
+            start,
+            apart,
+            record.frequency,
+            informed,
+            informed(record),
+            bool(moved),
         )
 
     @property
@@ -246,38 +347,58 @@ class Experiment(NamedTuple):
     def best(self, allowed: Float[np.ndarray, "3"], spread: float) -> Float[np.ndarray, " lines"]:
         """Mean square of every line [m²] such that the quantities become best known.
 
-        `allowed`: largest rms of displacement [m], speed [m/s] and acceleration [m/s²]; that of the displacement is finite.
-        Convex, in shares of steps of the density.
+        `allowed`: largest rms of displacement [m], speed [m/s] and acceleration [m/s²]; that of the
+        displacement is finite. Convex, in shares of steps of the density.
         """
         rms, omega = allowed[0], 2 * np.pi * self.frequency
         steps = steps_of(self.frequency)
         steps = (1 - spread) * steps + spread / len(self.frequency)
         each = rms**2 * np.tensordot(steps, self.lines, 1)
-        used = [(rms / most) ** 2 * steps @ omega ** (2 * order) for order, most in enumerate(allowed)]
+        used = [
+            (rms / most) ** 2 * steps @ omega ** (2 * order) for order, most in enumerate(allowed)
+        ]
 
         def height(share: np.ndarray) -> tuple[float, np.ndarray]:
             reached = np.linalg.solve(self.apart + np.tensordot(share, each, 1), self.rows.T)
             sum_of_variances = np.sum(self.rows.T * reached)
-            return np.log(sum_of_variances), -np.einsum("iq,kij,jq->k", reached, each, reached) / sum_of_variances
+            return (
+                np.log(sum_of_variances),
+                -np.einsum("iq,kij,jq->k", reached, each, reached) / sum_of_variances,
+            )
 
         within = [scipy.optimize.LinearConstraint(row, -np.inf, 1.0) for row in used]
         begin = np.full(len(steps), 1 / len(steps)) / max(map(np.mean, used))
         if np.max(-height(begin)[1]) < NOTHING:
-            raise ValueError(f"quantity: no motion within these limits tells of {' and '.join(self.quantity)}: raise rms, "
-                             "or choose another band")  # fmt: skip
-        found = scipy.optimize.minimize(height, begin, jac=True, method="SLSQP", bounds=[(0, 1)] * len(steps),
-                                        constraints=within, options={"maxiter": 500, "ftol": 1e-12})  # fmt: skip
+            raise ValueError(
+                f"quantity: no motion within these limits tells of {' and '.join(self.quantity)}:"
+                " raise rms, or choose another band"
+            )
+        found = scipy.optimize.minimize(
+            height,
+            begin,
+            jac=True,
+            method="SLSQP",
+            bounds=[(0, 1)] * len(steps),
+            constraints=within,
+            options={"maxiter": 500, "ftol": 1e-12},
+        )
         return rms**2 * np.maximum(found.x, 0) @ steps
 
-    def errors(self, power: Float[np.ndarray, " lines"] | None, times: float = 1.0) -> dict[str, float]:
-        """Standard errors of all quantities with a motion, if the record is so many `times` as long; without it if None."""
+    def errors(
+        self, power: Float[np.ndarray, " lines"] | None, times: float = 1.0
+    ) -> dict[str, float]:
+        """Standard errors of all quantities with a motion, if the record is so many `times` as
+        long; without it if None."""
         return self._errors(None if power is None else np.tensordot(power, self.lines, 1), times)
 
     def errors_of(self, record: Lengthening) -> dict[str, float]:
-        """Standard errors of all quantities with a motion of other lines. Needs double precision."""
+        """Standard errors of all quantities with a motion of other lines. Needs double
+        precision."""
         return self._errors(np.tensordot(record.power, self.informed(record), 1))
 
-    def _errors(self, motion: Float[np.ndarray, "free free"] | None, times: float = 1.0) -> dict[str, float]:
+    def _errors(
+        self, motion: Float[np.ndarray, "free free"] | None, times: float = 1.0
+    ) -> dict[str, float]:
         record = 0.0 if motion is None else self.apart - self.start + motion
         known = self.start + times * record
         after = np.linalg.pinv(known, hermitian=True)
@@ -286,10 +407,13 @@ class Experiment(NamedTuple):
     def by_prior(self) -> dict[str, float]:
         """Standard errors of all quantities without any data."""
         before = 1 / np.maximum(self.prior, LEAST_PRIOR)
-        return {name: float(np.sqrt(np.sum(before * g**2))) for name, g in self.here.gradients.items()}
+        return {
+            name: float(np.sqrt(np.sum(before * g**2))) for name, g in self.here.gradients.items()
+        }
 
     def towards(self, name: str) -> Float[np.ndarray, " free"]:
-        """The step `Σ g / √(gᵀ Σ g)` of the fit's θ to the likeliest muscle in which a quantity is a standard error larger.
+        """The step `Σ g / √(gᵀ Σ g)` of the fit's θ to the likeliest muscle in which a quantity is
+        a standard error larger.
 
         Σ is the covariance by what is known without the record.
         """
@@ -298,22 +422,37 @@ class Experiment(NamedTuple):
         return far / np.sqrt(g @ far)
 
     def times_for(self, power: Float[np.ndarray, " lines"], error: float) -> float:
-        """How many times as long a record must be for a relative error of every quantity; infinite where none is."""
+        """How many times as long a record must be for a relative error of every quantity; infinite
+        where none is."""
 
         def above(log_times: float) -> float:
             found = self.errors(power, np.exp(log_times))
-            return float(np.log(max(found[n] / abs(self.here.values[n][0] or 1.0) for n in self.quantity) / error))
+            return float(
+                np.log(
+                    max(found[n] / abs(self.here.values[n][0] or 1.0) for n in self.quantity)
+                    / error
+                )
+            )
 
         shortest, longest = np.log(1 / LONGEST), np.log(LONGEST)
         if above(longest) > 0:
             return np.inf
-        return 0.0 if above(shortest) <= 0 else float(np.exp(scipy.optimize.brentq(above, shortest, longest)))
+        return (
+            0.0
+            if above(shortest) <= 0
+            else float(np.exp(scipy.optimize.brentq(above, shortest, longest)))
+        )
 
 
 def steps_of(frequency: Float[np.ndarray, " lines"]) -> Float[np.ndarray, "steps lines"]:
     """Where the density may be raised: neighbouring lines, each with an equal share."""
     starts, n = [0], len(frequency)
-    while (following := max(starts[-1] + FEWEST, int(np.searchsorted(frequency, (1 + WIDTH) * frequency[starts[-1]])))) < n:
+    while (
+        following := max(
+            starts[-1] + FEWEST,
+            int(np.searchsorted(frequency, (1 + WIDTH) * frequency[starts[-1]])),
+        )
+    ) < n:
         starts.append(following)
     if n - starts[-1] < FEWEST and len(starts) > 1:
         starts.pop()
@@ -323,19 +462,30 @@ def steps_of(frequency: Float[np.ndarray, " lines"]) -> Float[np.ndarray, "steps
 
 
 def _as_moved(part: Part) -> Part:
-    """A part whose insertion is held as one in which a motor holds it: its stiffness as stretched there can be asked for."""
-    return dataclasses.replace(part, task=_moved(part.task)) if isinstance(part.task, Isometric) else part
+    """A part whose insertion is held as one in which a motor holds it: its stiffness as stretched
+    there can be asked for."""
+    return (
+        dataclasses.replace(part, task=_moved(part.task))
+        if isinstance(part.task, Isometric)
+        else part
+    )
 
 
 def _moved(task: Any) -> AbstractTask:
     """The experiment with the muscle of a task, at the same P_w and x_z."""
     if type(task) is PrescribedLength:
         return task
-    return task.as_task(PrescribedLength, **{name: getattr(task, name) for name in ("P_w", "x_z") if hasattr(task, name)})
+    return task.as_task(
+        PrescribedLength,
+        **{name: getattr(task, name) for name in ("P_w", "x_z") if hasattr(task, name)},
+    )
 
 
-def _problem(given: FitResult | AbstractTask) -> tuple[FitProblem, Float[np.ndarray, " free"], Iterable[str]]:
-    """A fit's problem, or that of a task with the data that it would give; θ, and what can be derived."""
+def _problem(
+    given: FitResult | AbstractTask,
+) -> tuple[FitProblem, Float[np.ndarray, " free"], Iterable[str]]:
+    """A fit's problem, or that of a task with the data that it would give; θ, and what can be
+    derived."""
     if isinstance(given, FitResult):
         return *fitted_problem(given, None), given.derived_names
     task = as_numbers(_moved(given))

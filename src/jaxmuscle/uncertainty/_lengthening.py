@@ -26,18 +26,22 @@ def require_positive(name: str, value: float, unit: str) -> None:
 
 
 def lines_in(band: tuple[float, float], seconds: float) -> Float[np.ndarray, " lines"]:
-    """Multiples of 1 / seconds [Hz] in a band, both ends included. Raises `ValueError` if there is none."""
+    """Multiples of 1 / seconds [Hz] in a band, both ends included. Raises `ValueError` if there is
+    none."""
     require_positive("seconds", seconds, "s")
     low, high = band
     first, last = np.ceil(low * seconds - WHOLE), np.floor(high * seconds + WHOLE)
     if not (0 < first <= last):
-        raise ValueError(f"band = ({low:g}, {high:g}) Hz must lie above 0 Hz, rise, and hold a multiple of 1 / seconds = "
-                         f"{1 / seconds:.3g} Hz")  # fmt: skip
+        raise ValueError(
+            f"band = ({low:g}, {high:g}) Hz must lie above 0 Hz, rise, and hold a multiple of 1 /"
+            f" seconds = {1 / seconds:.3g} Hz"
+        )
     return np.arange(first, last + 1) / seconds
 
 
 class Lengthening(Printed, Result, eqx.Module):
-    """A periodic lengthening of the muscle: `x(t) = Σ_k √(2 p_k) cos(2π f_k t + φ_k)`, recorded for one period.
+    """A periodic lengthening of the muscle: `x(t) = Σ_k √(2 p_k) cos(2π f_k t + φ_k)`, recorded for
+    one period.
 
     The phases φ_k may be any: what the record tells does not depend on them.
 
@@ -45,7 +49,8 @@ class Lengthening(Printed, Result, eqx.Module):
 
     - `frequency` f_k [Hz] (lines,), multiples of 1 / `seconds`
     - `power` p_k, the mean square of each line [m²] (lines,)
-    - `seconds`: how long it is recorded. `Lengthening.flat(rms, band, seconds)` makes one of equal lines
+    - `seconds`: how long it is recorded. `Lengthening.flat(rms, band, seconds)` makes one of equal
+      lines
     """
 
     frequency: Float[np.ndarray, " lines"]
@@ -54,18 +59,26 @@ class Lengthening(Printed, Result, eqx.Module):
 
     @classmethod
     def flat(cls, rms: float, band: tuple[float, float], seconds: float = 60.0) -> "Lengthening":
-        """Of `rms` [m], the same density at all frequencies of a `band` [Hz]. Raises `ValueError` for an impossible one."""
+        """Of `rms` [m], the same density at all frequencies of a `band` [Hz]. Raises `ValueError`
+        for an impossible one."""
         require_positive("rms", rms, "m")
         lines = lines_in(band, seconds)
         return cls(lines, np.full(len(lines), rms**2 / len(lines)), seconds)
 
     def within(self, most: Float[np.ndarray, "3"]) -> "Lengthening":
-        """Made smaller, so that displacement [m], speed [m/s] and acceleration [m/s²] are at most so large (rms)."""
-        reached = [np.sqrt(np.sum(self.power * (2 * np.pi * self.frequency) ** (2 * order))) for order in range(3)]
-        return Lengthening(self.frequency, self.power * min(1.0, *(most / reached)) ** 2, self.seconds)
+        """Made smaller, so that displacement [m], speed [m/s] and acceleration [m/s²] are at most
+        so large (rms)."""
+        reached = [
+            np.sqrt(np.sum(self.power * (2 * np.pi * self.frequency) ** (2 * order)))
+            for order in range(3)
+        ]
+        return Lengthening(
+            self.frequency, self.power * min(1.0, *(most / reached)) ** 2, self.seconds
+        )
 
     def of_motion(self, displacement: Float[np.ndarray, " samples"]) -> "Lengthening":
-        """One of the same frequencies, with the power of `displacement` [m], one period of a motion, at each of them."""
+        """One of the same frequencies, with the power of `displacement` [m], one period of a
+        motion, at each of them."""
         places = np.rint(self.frequency * self.seconds).astype(int)
         power = 2 * np.abs(np.fft.rfft(displacement)[places] / len(displacement)) ** 2
         return Lengthening(self.frequency, power, self.seconds)
@@ -82,7 +95,10 @@ class Lengthening(Printed, Result, eqx.Module):
 
     def __str__(self) -> str:
         moved = self.frequency[self.power > 0]
-        return f"lengthening of {1e3 * self.rms:.3g} mm rms, {moved[0]:.2g} to {moved[-1]:.2g} Hz, for {self.seconds:g} s"
+        return (
+            f"lengthening of {1e3 * self.rms:.3g} mm rms, {moved[0]:.2g} to {moved[-1]:.2g} Hz, for"
+            f" {self.seconds:g} s"
+        )
 
     def information(
         self, task: PrescribedLength, coordinates: Coordinates, theta: Float[np.ndarray, " own"]
@@ -91,7 +107,11 @@ class Lengthening(Printed, Result, eqx.Module):
 
         For the package itself: `coordinates` and `theta` are those of the problem of a fit.
         """
-        return np.tensordot(self.power, information_of_lines(task, coordinates, theta, self.frequency, self.seconds), 1)
+        return np.tensordot(
+            self.power,
+            information_of_lines(task, coordinates, theta, self.frequency, self.seconds),
+            1,
+        )
 
 
 def information_of_lines(
@@ -101,22 +121,27 @@ def information_of_lines(
     frequency: Float[np.ndarray, " lines"],
     seconds: float,
 ) -> Float[np.ndarray, "lines own own"]:
-    """Fisher information of θ per mean square [1/m²] of each line of the lengthening, where the task is that at θ.
+    """Fisher information of θ per mean square [1/m²] of each line of the lengthening, where the
+    task is that at θ.
 
         A_k = 2 T Re(∂H_k* ∂H_kᵀ) / S(f_k)
 
-    H is the `dynamic_stiffness`, S the one-sided `noise_density` of the force. For a line `a cos(2π f t)`, of mean square
-    p = a²/2, changes the ordinate of the force by ∂H a/2, while real and imaginary part of the noise there have the
-    variance S / (4T) each.
+    H is the `dynamic_stiffness`, S the one-sided `noise_density` of the force. For a line `a cos(2π
+    f t)`, of mean square p = a²/2, changes the ordinate of the force by ∂H a/2, while real and
+    imaginary part of the noise there have the variance S / (4T) each.
     """
     padded = np.resize(frequency, -(-len(frequency) // EVEN) * EVEN)
-    slopes, density = jax.tree.map(np.asarray, _sensed(as_arrays(task), as_arrays(coordinates), theta, padded))
+    slopes, density = jax.tree.map(
+        np.asarray, _sensed(as_arrays(task), as_arrays(coordinates), theta, padded)
+    )
     slopes, density = slopes[:, : len(frequency)], density[: len(frequency)]
     return 2 * seconds * np.einsum("pki,pkj->kij", slopes, slopes) / density[:, None, None]
 
 
 @kept
-def _sensed(task: Any, coordinates: Any, theta: Any, f: Any) -> tuple[Float[Array, "2 lines own"], Float[Array, " lines"]]:
+def _sensed(
+    task: Any, coordinates: Any, theta: Any, f: Any
+) -> tuple[Float[Array, "2 lines own"], Float[Array, " lines"]]:
     """Slopes of real and imaginary part of the dynamic stiffness, and the density of the noise."""
 
     def parts(theta):

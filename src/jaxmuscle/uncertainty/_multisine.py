@@ -15,18 +15,23 @@ def multisine(
     limits: Float[np.ndarray, "3"],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, " samples"]:
-    """One period of `Σ_k √(2 p_k) cos(2π n_k t / T + φ_k)`, n_k the `lines`: whole numbers of periods in the record.
+    """One period of `Σ_k √(2 p_k) cos(2π n_k t / T + φ_k)`, n_k the `lines`: whole numbers of
+    periods in the record.
 
-    The phases start at random. Then the highest peaks are clipped off and the phases of what is left are taken, again and
-    again (time-frequency swapping): of position, velocity or acceleration, whichever is nearest to its limit ([m], [m/s],
-    [m/s²]; infinite: none). Of several starts the best. The period begins near a zero of slow motion.
+    The phases start at random. Then the highest peaks are clipped off and the phases of what is
+    left are taken, again and again (time-frequency swapping): of position, velocity or
+    acceleration, whichever is nearest to its limit ([m], [m/s], [m/s²]; infinite: none). Of several
+    starts the best. The period begins near a zero of slow motion.
 
     **Source:** van der Ouderaa, Schoukens & Renneboog 1988, doi:10.1109/19.2679.
     """
     places, fine = np.rint(lines).astype(int), max(FINE * round(lines[-1]), 64)
     size, rate = np.sqrt(2 * power), 2j * np.pi * lines / seconds
-    # Of every derivative that has a limit: what its spectrum is of that of the position, in units of the limit.
-    scales = [rate**order / limit for order, limit in enumerate(limits) if np.isfinite(limit)] or [np.ones_like(rate)]
+    # Of every derivative that has a limit: what its spectrum is of that of the position, in units
+    # of the limit.
+    scales = [rate**order / limit for order, limit in enumerate(limits) if np.isfinite(limit)] or [
+        np.ones_like(rate)
+    ]
     phases = np.exp(2j * np.pi * rng.random((STARTS, len(lines))))
     best, lowest = phases, np.full((STARTS, 1), np.inf)
     for _ in range(ROUNDS):
@@ -44,7 +49,9 @@ def multisine(
     return np.roll(moved, -int(np.argmin(slow)))
 
 
-def speed_of(displacement: Float[np.ndarray, " samples"], seconds: float) -> Float[np.ndarray, " samples"]:
+def speed_of(
+    displacement: Float[np.ndarray, " samples"], seconds: float
+) -> Float[np.ndarray, " samples"]:
     """Velocity of one period of a motion."""
     n = len(displacement)
     return np.fft.irfft(np.fft.rfft(displacement) * 2j * np.pi * np.arange(n // 2 + 1) / seconds, n)

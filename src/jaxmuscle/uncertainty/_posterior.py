@@ -1,4 +1,5 @@
-"""The posterior of a fit's parameters: Hamiltonian chains, what they say, and whether they may be believed."""
+"""The posterior of a fit's parameters: Hamiltonian chains, what they say, and whether they may be
+believed."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -48,21 +49,24 @@ def posterior(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     progress: bool | Callable[[str, float], None] = False,
 ) -> Posterior:
-    """Draw from the posterior of a fit's parameters in linear response, by Hamiltonian Monte Carlo from dispersed starts.
+    """Draw from the posterior of a fit's parameters in linear response, by Hamiltonian Monte Carlo
+    from dispersed starts.
 
         print(jm.posterior(result, target, key=jax.random.key(2)).summary())
 
         p(θ | data) ∝ L(θ) Π_j exp(-θ_j² / 2)
 
-    L is the likelihood of `log_likelihood`: gamma-distributed, correlated Welch bins, their unknown total sampled along; or
-    Gaussian where the target states a sigma. θ are the free parameters' distances from the prior's centre in prior standard
-    deviations (logarithms for positive ones; the parameter table has them). The harmonic's frequency, which has many modes,
-    is summed over a grid while the chains run, and drawn for every state of theirs afterwards: no mode can be missed by
-    chains that do not cross.
+    L is the likelihood of `log_likelihood`: gamma-distributed, correlated Welch bins, their unknown
+    total sampled along; or Gaussian where the target states a sigma. θ are the free parameters'
+    distances from the prior's centre in prior standard deviations (logarithms for positive ones;
+    the parameter table has them). The harmonic's frequency, which has many modes, is summed over a
+    grid while the chains run, and drawn for every state of theirs afterwards: no mode can be missed
+    by chains that do not cross.
 
     **Arguments:**
 
-    - `result` of `fit` (prior, bounds and free parameters are the fit's unless given) and its `target`
+    - `result` of `fit` (prior, bounds and free parameters are the fit's unless given) and its
+      `target`
     - `key`: a `jax.random` key or a seed number
     - `chains`: how many
     - `draws` of each (by default 600, and as long as the chains have not mixed up to 3000)
@@ -74,15 +78,19 @@ def posterior(
 
     **Returns:** a `Posterior`; check `success` or call `summary()`.
 
-    **Raises:** `ValueError` for a target that states neither segments nor sigma, a prior centred outside its bounds, a flat
-    one without bounds, a fit that failed, a task without linear response; `ImportError` without blackjax (extra
-    `posterior`).
+    **Raises:** `ValueError` for a target that states neither segments nor sigma, a prior centred
+    outside its bounds, a flat one without bounds, a fit that failed, a task without linear
+    response; `ImportError` without blackjax (extra `posterior`).
 
-    **Source:** Neal 2011, arXiv:1206.1901 (Hamiltonian Monte Carlo, trajectories of random length); Vehtari et al. 2021,
-    doi:10.1214/20-BA1221 (R-hat, effective sample size).
+    **Source:** Neal 2011, arXiv:1206.1901 (Hamiltonian Monte Carlo, trajectories of random length);
+    Vehtari et al. 2021, doi:10.1214/20-BA1221 (R-hat, effective sample size).
     """
     lengths = DRAWS if draws is None else (draws,)
-    for name, count, least in (("chains", chains, 2), ("draws", lengths[0], 100), ("warmup", warmup, 1)):
+    for name, count, least in (
+        ("chains", chains, 2),
+        ("draws", lengths[0], 100),
+        ("warmup", warmup, 1),
+    ):
         if count < least:
             raise ValueError(f"{name} = {count} must be at least {least}")
     with told(progress, f"posterior of {result.title}") as tell, fitting():
@@ -90,21 +98,33 @@ def posterior(
         limits = bounds_of(result, problem.coordinates.names, bounds)
         likelihood = Likelihood.of(problem)
         tell("searching the most probable parameters", 0.0)
-        density, _, _ = density_about(problem, likelihood, problem.theta_of(tuple(result.tasks.values())))
+        density, _, _ = density_about(
+            problem, likelihood, problem.theta_of(tuple(result.tasks.values()))
+        )
         attempts = (
             _reported(problem, whitened, found, result, key, warmup, limits)
-            for found, whitened in sample(density, fold_in(problem.key, 5), chains, lengths, warmup, tell)
+            for found, whitened in sample(
+                density, fold_in(problem.key, 5), chains, lengths, warmup, tell
+            )
         )
         drawn = next(attempts)
-        while not (drawn.success or diverges(drawn.chains)) and (longer := next(attempts, None)) is not None:
+        while (
+            not (drawn.success or diverges(drawn.chains))
+            and (longer := next(attempts, None)) is not None
+        ):
             drawn = longer
         return drawn
 
 
 def _reported(
-    problem: FitProblem, density: PosteriorDensity, found: Chains, result: FitResult, key: Key, warmup: int,
+    problem: FitProblem,
+    density: PosteriorDensity,
+    found: Chains,
+    result: FitResult,
+    key: Key,
+    warmup: int,
     limits: dict[str, tuple[float, float]],
-) -> Posterior:  # fmt: skip
+) -> Posterior:
     shape, names = found.log_density.shape, problem.coordinates.names
     theta, s = _thetas(problem, density, found)
     found = found._replace(s=s)
@@ -118,10 +138,13 @@ def _reported(
     diagnostics = {name: diagnosed(x) for name, x in (samples | known).items()}
     success, message = verdict(found, diagnostics, determined)
     settings = settings_of(problem, limits) | {
-        "chains": shape[0], "draws": shape[1], "warmup": warmup, "step_size": found.step_size,
+        "chains": shape[0],
+        "draws": shape[1],
+        "warmup": warmup,
+        "step_size": found.step_size,
         "frequencies": max(1, sum(len(np.unique(band.frequency)) for band in density.bands)),
         "spectrum": {part.target.name: part.target.settings.to_dict() for part in problem.parts},
-    }  # fmt: skip
+    }
     modes = {band.name: modes_of(samples[band.name].ravel()) for band in density.bands}
     parts = {}
     for i, (name, part) in enumerate(zip(result.parts, problem.parts, strict=True)):
@@ -129,15 +152,32 @@ def _reported(
         drawing = fold_in(drawing, i) if i else drawing
         drawn = replicates(density.likelihood.bins[i], part.target, moments[i], shape, drawing)
         own = part.coordinates.values_of(part.own(flat))
-        task = part.task.replace(**{n: float(np.median(own[:, j])) for j, n in enumerate(part.coordinates.names)})
+        task = part.task.replace(
+            **{n: float(np.median(own[:, j])) for j, n in enumerate(part.coordinates.names)}
+        )
         shared = {n: names[c] for n, c in zip(part.coordinates.names, part.columns, strict=True)}
         parts[name] = PosteriorPart(part.target, task, drawn, shared)
-    return Posterior(success, message, parts, samples, known, diagnostics, determined, modes, found, settings,
-                     number_of(key), versions())  # fmt: skip
+    return Posterior(
+        success,
+        message,
+        parts,
+        samples,
+        known,
+        diagnostics,
+        determined,
+        modes,
+        found,
+        settings,
+        number_of(key),
+        versions(),
+    )
 
 
-def _thetas(problem: FitProblem, density: PosteriorDensity, found: Chains) -> tuple[np.ndarray, np.ndarray]:
-    """θ of every draw, each harmonic's frequency drawn from its grid given the rest, anywhere in its cell; s and offsets."""
+def _thetas(
+    problem: FitProblem, density: PosteriorDensity, found: Chains
+) -> tuple[np.ndarray, np.ndarray]:
+    """θ of every draw, each harmonic's frequency drawn from its grid given the rest, anywhere in
+    its cell; s and offsets."""
     coordinates, names = problem.coordinates, problem.coordinates.names
     both = found.s.reshape(-1, found.s.shape[-1])
     parts = [np.asarray(_placed(density, part)) for part in _filled(both)]
@@ -145,9 +185,13 @@ def _thetas(problem: FitProblem, density: PosteriorDensity, found: Chains) -> tu
     theta = np.asarray(coordinates.theta(s))
     if density.bands:
         white = np.linalg.solve(np.asarray(density.scale), (both - np.asarray(density.centre)).T).T
-        for number, (band, heights) in enumerate(zip(density.bands, _heights(density, white), strict=True)):
+        for number, (band, heights) in enumerate(
+            zip(density.bands, _heights(density, white), strict=True)
+        ):
             key = fold_in(problem.key, 6)
-            chosen, place = map(np.asarray, _cells(fold_in(key, number) if number else key, heights))
+            chosen, place = map(
+                np.asarray, _cells(fold_in(key, number) if number else key, heights)
+            )
             edges = edges_of(np.asarray(band.frequency))
             frequency = edges[chosen] + place * (edges[chosen + 1] - edges[chosen])
             theta[:, names.index(band.name)] = coordinates.theta_of(band.name, frequency)
@@ -188,7 +232,9 @@ def _filled(rows: np.ndarray) -> list[np.ndarray]:
 def _consequences(objective: Residuals, theta: np.ndarray) -> tuple[Tables, Any]:
     """Derived quantities and moments of every part at every θ."""
     parts = list(enumerate(objective.parts))
-    rows = [tuple(_values(part, objective.own(some, i)) for i, part in parts) for some in _filled(theta)]
+    rows = [
+        tuple(_values(part, objective.own(some, i)) for i, part in parts) for some in _filled(theta)
+    ]
     found = jax.tree.map(lambda *x: np.concatenate(x)[: len(theta)], *rows)
     return tuple(values for values, _ in found), tuple(moments for _, moments in found)
 
@@ -197,6 +243,9 @@ def _consequences(objective: Residuals, theta: np.ndarray) -> tuple[Tables, Any]
 def _values(part: PartResiduals, theta: Array | np.ndarray) -> tuple[dict[str, Array], Any]:
     def one(theta):
         moments = part.moments(theta)
-        return derived(task_at(part.task, part.coordinates, theta), moments, frequency_of(part)), moments
+        return (
+            derived(task_at(part.task, part.coordinates, theta), moments, frequency_of(part)),
+            moments,
+        )
 
     return jax.lax.map(one, jnp.asarray(theta), batch_size=16)

@@ -1,4 +1,5 @@
-"""The posterior density with the harmonic's frequency, where it has many modes, summed over a grid."""
+"""The posterior density with the harmonic's frequency, where it has many modes, summed over a
+grid."""
 
 import dataclasses
 from functools import partial
@@ -32,10 +33,11 @@ from ._frequency_grid import Band, band_about
 
 
 class Features(NamedTuple):
-    """What the spectra at all frequencies of the harmonic follow from: the noise, and the line's response to any frequency.
+    """What the spectra at all frequencies of the harmonic follow from: the noise, and the line's
+    response to any frequency.
 
-    `numerator` and `denominator` are coefficients of powers of s, highest first: a harmonic of real and imaginary part
-    `size` has the line `size numerator(s) / denominator(s)`, s = iω.
+    `numerator` and `denominator` are coefficients of powers of s, highest first: a harmonic of real
+    and imaginary part `size` has the line `size numerator(s) / denominator(s)`, s = iω.
     """
 
     power: Float[Array, " bins"]
@@ -47,33 +49,49 @@ class Features(NamedTuple):
     stiffness: Float[Array, "2 points"] | tuple[()]
 
     def moments(self, frequency: Float[Array, " grid"], table: LineTable) -> Moments:
-        """Moments with the harmonic at each frequency, the last axis of the powers and the only one of the variance.
+        """Moments with the harmonic at each frequency, the last axis of the powers and the only one
+        of the variance.
 
-        Powers are in units of the noise's, in the precision of the table. They end with the last frequency whose line shows
-        in the bins, and with no line at all.
+        Powers are in units of the noise's, in the precision of the table. They end with the last
+        frequency whose line shows in the bins, and with no line at all.
         """
         s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
-        reply = jax.lax.complex(*self.size) * polynomial(self.numerator, s) / polynomial(self.denominator, s)
+        reply = (
+            jax.lax.complex(*self.size)
+            * polynomial(self.numerator, s)
+            / polynomial(self.denominator, s)
+        )
         scale = jax.lax.stop_gradient(jnp.sum(self.power))
-        line = table.power(reply[: table.level.shape[-1]] * jax.lax.rsqrt(scale).astype(reply.dtype))
+        line = table.power(
+            reply[: table.level.shape[-1]] * jax.lax.rsqrt(scale).astype(reply.dtype)
+        )
         line = jnp.pad(line, ((0, 0), (0, 1)))
         power = (self.power / scale).astype(line.dtype)
         unknown = jnp.full((), jnp.nan)
-        return Moments(power[:, None] + line, line, self.mean, self.variance + table.variance(reply), unknown, unknown,
-                       stiffness=self.stiffness)  # fmt: skip
+        return Moments(
+            power[:, None] + line,
+            line,
+            self.mean,
+            self.variance + table.variance(reply),
+            unknown,
+            unknown,
+            stiffness=self.stiffness,
+        )
 
 
 GRID = Moments(1, 1, None, 0, None, None, None, None)  # pyright: ignore  # which axis counts the frequencies
 
 
 class Level(eqx.Module):
-    """The common scale of the amplitudes, as the coordinate of one of them, counted from a fixed coefficient of variation.
+    """The common scale of the amplitudes, as the coordinate of one of them, counted from a fixed
+    coefficient of variation.
 
-    Only the coefficient of variation shows that scale, and narrowly: in the amplitudes themselves the posterior is a thin
-    curved sheet that chains hardly follow; counted from there the scale is all but a normal variable of its own. `column`
-    is the coordinate of one amplitude, `start` its value at the maximum, `sd` its prior standard deviation,
-    `log_variation` that of the `part` at the maximum, `along` what a common factor does to all coordinates, `weight` of the
-    part's harmonic frequencies.
+    Only the coefficient of variation shows that scale, and narrowly: in the amplitudes themselves
+    the posterior is a thin curved sheet that chains hardly follow; counted from there the scale is
+    all but a normal variable of its own. `column` is the coordinate of one amplitude, `start` its
+    value at the maximum, `sd` its prior standard deviation, `log_variation` that of the `part` at
+    the maximum, `along` what a common factor does to all coordinates, `weight` of the part's
+    harmonic frequencies.
     """
 
     start: Float[Array | np.ndarray, ""]
@@ -89,13 +107,16 @@ Systems = dict[int, Linearisation]
 
 
 class PosteriorDensity(eqx.Module):
-    """Log posterior density of the unbounded coordinates s (without the harmonics' frequencies) and the offsets u.
+    """Log posterior density of the unbounded coordinates s (without the harmonics' frequencies) and
+    the offsets u.
 
-        ln p(s, u) = Σ_b ln Σ_j w_bj Π_i L_i(θ(s), f_bj, u_i) + Σ_i ln L_i(θ(s), u_i) - ½ Σ θ² + ln |dθ/ds|
+        ln p(s, u) = Σ_b ln Σ_j w_bj Π_i L_i(θ(s), f_bj, u_i) + Σ_i ln L_i(θ(s), u_i)
+                     - ½ Σ θ² + ln |dθ/ds|
 
-    over the `bands` b, each a grid of a harmonic's frequency with the targets i that it acts on, and over the other targets.
-    `columns` are the sampled coordinates among the free ones, `offsets` the targets whose u is sampled, `centre` and `scale`
-    whiten both, some of the coordinates being counted from `levels` (the Jacobian of which is 1).
+    over the `bands` b, each a grid of a harmonic's frequency with the targets i that it acts on,
+    and over the other targets. `columns` are the sampled coordinates among the free ones, `offsets`
+    the targets whose u is sampled, `centre` and `scale` whiten both, some of the coordinates being
+    counted from `levels` (the Jacobian of which is 1).
     """
 
     likelihood: Likelihood
@@ -112,8 +133,11 @@ class PosteriorDensity(eqx.Module):
         """How many numbers are sampled."""
         return len(self.columns) + len(self.offsets)
 
-    def split(self, white: Float[Array, " sampled"]) -> tuple[Float[Array, " free"], Float[Array, " parts"]]:
-        """Unbounded coordinates (with the point's own where not sampled) and the offsets of whitened ones."""
+    def split(
+        self, white: Float[Array, " sampled"]
+    ) -> tuple[Float[Array, " free"], Float[Array, " parts"]]:
+        """Unbounded coordinates (with the point's own where not sampled) and the offsets of
+        whitened ones."""
         return self.placed(self.centre + self.scale @ white)[:2]
 
     def placed(
@@ -130,7 +154,10 @@ class PosteriorDensity(eqx.Module):
         """Coordinates s of which some are counted from a level, as they are."""
         systems: Systems = {}
         for level in self.levels:
-            s, above = s.at[level.column].set(level.start), level.sd * (s[level.column] - level.start)
+            s, above = (
+                s.at[level.column].set(level.start),
+                level.sd * (s[level.column] - level.start),
+            )
             found, systems[level.part] = self.log_variation(s, level.part, level.weight)
             s = s + (level.log_variation + above - found) * level.along
         return s, systems
@@ -143,16 +170,24 @@ class PosteriorDensity(eqx.Module):
         """One part's task at s."""
         objective = self.likelihood.objective
         own = objective.parts[part]
-        return task_at(own.task, own.coordinates, objective.own(objective.coordinates.theta(s), part))
+        return task_at(
+            own.task, own.coordinates, objective.own(objective.coordinates.theta(s), part)
+        )
 
     def log_variation(
         self, s: Float[Array, " free"], part: int, weight: Float[Array | np.ndarray, " grid"]
     ) -> tuple[Scalar, Linearisation]:
-        """Log coefficient of variation of a long recording, the harmonic's frequencies weighted; the linearised task."""
+        """Log coefficient of variation of a long recording, the harmonic's frequencies weighted;
+        the linearised task."""
         task, band = self.task(s, part), self.band_of(part)
         system = linearise(task)
-        variance, (top, below) = noise_variance(task, system), polynomials(harmonic_system(task, system))
-        frequency = jnp.atleast_1d(task.harmonic.frequency if band is None else jnp.asarray(band.frequency))
+        variance, (top, below) = (
+            noise_variance(task, system),
+            polynomials(harmonic_system(task, system)),
+        )
+        frequency = jnp.atleast_1d(
+            task.harmonic.frequency if band is None else jnp.asarray(band.frequency)
+        )
         s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
         reply = harmonic_size(task, system.A.dtype) * polynomial(top, s) / polynomial(below, s)
         line = 0.5 * jnp.sum(weight * (jnp.real(reply) ** 2 + jnp.imag(reply) ** 2))
@@ -168,10 +203,21 @@ class PosteriorDensity(eqx.Module):
         size = jnp.stack([jnp.real(size), jnp.imag(size)])
         power = jnp.sum(power, axis=0)[model.chosen] * model.correction.power
         stiffness = () if model.points is None else parts_of_stiffness(task, system, model.points)
-        return Features(power, system.rest, variance, size, *polynomials(harmonic_system(task, system)), stiffness)
+        return Features(
+            power,
+            system.rest,
+            variance,
+            size,
+            *polynomials(harmonic_system(task, system)),
+            stiffness,
+        )
 
     def heights(
-        self, band: Band, s: Float[Array, " free"], offsets: Float[Array, " parts"], systems: Systems
+        self,
+        band: Band,
+        s: Float[Array, " free"],
+        offsets: Float[Array, " parts"],
+        systems: Systems,
     ) -> Float[Array, " grid"]:
         """Log likelihood of a band's targets at every frequency, with the weights of the grid."""
         found = jnp.asarray(band.log_weight)
@@ -185,8 +231,12 @@ class PosteriorDensity(eqx.Module):
                 found += jax.vmap(lambda m, own=own: own(m), in_axes=(GRID,))(spread)
             else:
                 law, offset = as_arrays((bins, offsets[part]), moments.power.dtype)
-                found += log_density(law, moments.power, moments.line, offset)[which].astype(found.dtype)
-                found += jax.vmap(lambda m, i=part: self.likelihood.further(i, m), in_axes=(GRID,))(spread)
+                found += log_density(law, moments.power, moments.line, offset)[which].astype(
+                    found.dtype
+                )
+                found += jax.vmap(lambda m, i=part: self.likelihood.further(i, m), in_axes=(GRID,))(
+                    spread
+                )
         return found
 
     def log_prior(self, s: Float[Array, " free"]) -> Scalar:
@@ -207,7 +257,9 @@ class PosteriorDensity(eqx.Module):
         for part, bins in enumerate(self.likelihood.bins):
             if self.band_of(part) is None:
                 objective = self.likelihood.objective
-                moments = objective.parts[part].moments(jnp.asarray(objective.own(objective.coordinates.theta(s), part)))
+                moments = objective.parts[part].moments(
+                    jnp.asarray(objective.own(objective.coordinates.theta(s), part))
+                )
                 found += self.likelihood.of_part(part, moments, offsets[part], bins)
         return jnp.where(jnp.isfinite(found), found, -jnp.inf)
 
@@ -222,21 +274,29 @@ def density_about(
 ) -> tuple[PosteriorDensity, Maximum, int]:
     """The density about the highest of the maxima climbed to from θ, and these.
 
-    Raises `ValueError` for a prior that is not proper and for a frequency that cannot be summed over.
+    Raises `ValueError` for a prior that is not proper and for a frequency that cannot be summed
+    over.
     """
     coordinates, names = problem.coordinates, problem.coordinates.names
     for name, precision, low in zip(names, problem.prior, coordinates.low, strict=True):
         if precision == 0 and not np.isfinite(low):
-            raise ValueError(f"the prior of {name} is flat and without bounds, so there is no posterior: give it a prior "
-                             f"(priors={{{name!r}: sd}}) or bounds ({name!r}: (low, high))")  # fmt: skip
+            raise ValueError(
+                f"the prior of {name} is flat and without bounds, so there is no posterior: give it"
+                f" a prior (priors={{{name!r}: sd}}) or bounds ({name!r}: (low, high))"
+            )
     peak, best = highest(problem, likelihood, theta, problem.prior)
     summed = frequency_names(coordinates)
     bands = tuple(band_about(problem, peak, name) for name in summed)
     columns = tuple(i for i, name in enumerate(names) if name not in summed)
-    s, offsets = coordinates.from_theta(peak.theta[best]), tuple(i for i, b in enumerate(likelihood.bins) if b is not None)
+    s, offsets = (
+        coordinates.from_theta(peak.theta[best]),
+        tuple(i for i, b in enumerate(likelihood.bins) if b is not None),
+    )
     stretch = np.append(coordinates.stretch(s), np.ones(len(likelihood.bins)))
     sampled = [*columns, *(len(names) + i for i in offsets)]
-    covariance = np.linalg.pinv(peak.curvature[best] * stretch[:, None] * stretch, hermitian=True)[np.ix_(sampled, sampled)]
+    covariance = np.linalg.pinv(peak.curvature[best] * stretch[:, None] * stretch, hermitian=True)[
+        np.ix_(sampled, sampled)
+    ]
     scale = np.linalg.cholesky(covariance + 1e-10 * np.diag(np.diag(covariance)))
     centre = np.append(s, peak.offset[best])[sampled]
     made = PosteriorDensity(likelihood, bands, s, centre, scale, (), columns, offsets)
@@ -252,7 +312,8 @@ def density_about(
 
 
 def _levels(problem: FitProblem, made: PosteriorDensity, offsets: np.ndarray) -> tuple[Level, ...]:
-    """A level for every coefficient of variation that is known, where amplitudes of its own are free and without bounds."""
+    """A level for every coefficient of variation that is known, where amplitudes of its own are
+    free and without bounds."""
     c = problem.coordinates
     base = [name.partition("@")[0] for name in c.names]
     amplitudes = {name for part in problem.parts for name in amplitude_names(part.task)}
@@ -261,12 +322,20 @@ def _levels(problem: FitProblem, made: PosteriorDensity, offsets: np.ndarray) ->
     s, levels = np.asarray(made.point), []
     for i, part in enumerate(problem.parts):
         loose = open_now & np.isin(np.arange(len(base)), part.columns)
-        if part.variation is None or not loose.any() or not isinstance(part.task.harmonic.envelope, Constant):
+        if (
+            part.variation is None
+            or not loose.any()
+            or not isinstance(part.task.harmonic.envelope, Constant)
+        ):
             continue
         weight, variation = map(np.asarray, _weights(made, s, offsets, i))
         column = int(np.argmax(np.where(loose, [n != "harmonic_amplitude" for n in base], -1.0)))
         along = np.where(loose, 1 / c.sd, 0.0)
-        levels.append(Level(np.asarray(s[column]), np.asarray(c.sd[column]), variation, along, weight, column, i))
+        levels.append(
+            Level(
+                np.asarray(s[column]), np.asarray(c.sd[column]), variation, along, weight, column, i
+            )
+        )
         open_now = open_now & ~loose
     return tuple(levels)
 
@@ -281,7 +350,12 @@ def _levelling(made: PosteriorDensity, s: Array | np.ndarray) -> Array:
 def _weights(
     made: PosteriorDensity, point: Array | np.ndarray, offsets: Array | np.ndarray, part: int
 ) -> tuple[Array, Array]:
-    """Of the frequencies of the band that acts on a part; the log coefficient of variation with these."""
+    """Of the frequencies of the band that acts on a part; the log coefficient of variation with
+    these."""
     band, s = made.band_of(part), jnp.asarray(point)
-    weight = jnp.ones(1) if band is None else jax.nn.softmax(made.heights(band, s, jnp.asarray(offsets), {}))
+    weight = (
+        jnp.ones(1)
+        if band is None
+        else jax.nn.softmax(made.heights(band, s, jnp.asarray(offsets), {}))
+    )
     return weight, made.log_variation(s, part, weight)[0]

@@ -35,11 +35,12 @@ Modes = tuple[tuple[float, float, float, float], ...]
 
 
 class PosteriorPart(eqx.Module):
-    """One target of a posterior: its `task` at the medians; `replicates`, what spectra the posterior predicts.
+    """One target of a posterior: its `task` at the medians; `replicates`, what spectra the
+    posterior predicts.
 
-    `replicates` has an entry for every draw: proportional powers `expected` by the model and `power` drawn about it; `chi2`
-    of the measured and `chi2_drawn` of the drawn spectrum about the same model; and over all draws `p_value`, how often
-    the drawn one is further away.
+    `replicates` has an entry for every draw: proportional powers `expected` by the model and
+    `power` drawn about it; `chi2` of the measured and `chi2_drawn` of the drawn spectrum about the
+    same model; and over all draws `p_value`, how often the drawn one is further away.
 
     `names` {parameter of the task: name among the samples}.
     """
@@ -51,16 +52,19 @@ class PosteriorPart(eqx.Module):
 
 
 class Posterior(Shown, eqx.Module):
-    """Draws from the posterior of a fit, of one target or of several; arrays have leading axes (chain, draw).
+    """Draws from the posterior of a fit, of one target or of several; arrays have leading axes
+    (chain, draw).
 
-    `success` and `message`: whether the chains mixed, or why not; `parts`, a `PosteriorPart` for each target by name;
-    `samples` of the free parameters and `derived` quantities in the units of the table of parameters; `diagnostics` {name:
-    (R-hat, effective size of the bulk, of the tails)}; `determined`, the names that the data determine; `frequency_modes`
-    {harmonic frequency: ((from, median, to, probability), ...)}, of each mode its lowest draw, median and highest draw
-    [Hz], and its share of the draws; `chains`, how the draws were made, with fields for every draw: `s`, its values in the
-    sampler's own unbounded coordinates (`samples` has the same draw in units), `log_density` there, `acceptance`, `steps`,
-    `diverging`; and for all together `step_size`; `settings`, how the draws were asked for: free parameters with prior and
-    bounds, chains, draws, warm-up, and the spectrum settings.
+    `success` and `message`: whether the chains mixed, or why not; `parts`, a `PosteriorPart` for
+    each target by name; `samples` of the free parameters and `derived` quantities in the units of
+    the table of parameters; `diagnostics` {name: (R-hat, effective size of the bulk, of the
+    tails)}; `determined`, the names that the data determine; `frequency_modes` {harmonic frequency:
+    ((from, median, to, probability), ...)}, of each mode its lowest draw, median and highest draw
+    [Hz], and its share of the draws; `chains`, how the draws were made, with fields for every draw:
+    `s`, its values in the sampler's own unbounded coordinates (`samples` has the same draw in
+    units), `log_density` there, `acceptance`, `steps`, `diverging`; and for all together
+    `step_size`; `settings`, how the draws were asked for: free parameters with prior and bounds,
+    chains, draws, warm-up, and the spectrum settings.
 
     A posterior of one target has `target`, `task` and `replicates` of its own.
     """
@@ -80,7 +84,8 @@ class Posterior(Shown, eqx.Module):
 
     @property
     def only(self) -> PosteriorPart:
-        """The part of a posterior of one target. Raises `AttributeError` where there are several."""
+        """The part of a posterior of one target. Raises `AttributeError` where there are
+        several."""
         return only(self.parts, "posterior")
 
     target = of_only("target", "The target.")
@@ -103,7 +108,9 @@ class Posterior(Shown, eqx.Module):
     @property
     def model(self) -> str:
         """Tasks and noises in words."""
-        kinds = (f"{type(p.task).__name__}, {type(p.task.noise).__name__}" for p in self.parts.values())
+        kinds = (
+            f"{type(p.task).__name__}, {type(p.task.noise).__name__}" for p in self.parts.values()
+        )
         return "; ".join(dict.fromkeys(kinds))
 
     @property
@@ -117,14 +124,23 @@ class Posterior(Shown, eqx.Module):
         return self.samples | self.derived
 
     def summary(self) -> "Summary":
-        """Mean, sd, median and 95 % interval of every quantity. Raises `NotMixedError` if the chains did not mix."""
+        """Mean, sd, median and 95 % interval of every quantity. Raises `NotMixedError` if the
+        chains did not mix."""
         if not self.success:
             raise NotMixedError(f"{self.title}: {self.message}")
         rows = {}
         for name, draws in self.quantities.items():
             low, middle, high = np.quantile(draws, (CREDIBLE[0], 0.5, CREDIBLE[1]))
-            rows[name] = (float(draws.mean()), float(draws.std(ddof=1)), float(middle), float(low), float(high))
-        return Summary(rows, self.diagnostics, self.determined, {n: self.unit(n) for n in rows}, self._told())
+            rows[name] = (
+                float(draws.mean()),
+                float(draws.std(ddof=1)),
+                float(middle),
+                float(low),
+                float(high),
+            )
+        return Summary(
+            rows, self.diagnostics, self.determined, {n: self.unit(n) for n in rows}, self._told()
+        )
 
     def unit(self, name: str) -> str:
         """Unit of a parameter or derived quantity."""
@@ -138,29 +154,42 @@ class Posterior(Shown, eqx.Module):
         values = {}
         for name, shared in part.names.items():
             draws = self.samples[shared]
-            value, middle, own = float(draws[chain, draw]), float(np.median(draws)), float(part.task[name])
+            value, middle, own = (
+                float(draws[chain, draw]),
+                float(np.median(draws)),
+                float(part.task[name]),
+            )
             # A proportional parameter keeps its ratio to the first target's.
             values[name] = value if middle == own else value * own / middle
         return part.task.replace(**values)
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row for each draw: `chain`, `draw`, then every parameter and derived quantity; `summary()` has a table, too."""
+        """A row for each draw: `chain`, `draw`, then every parameter and derived quantity;
+        `summary()` has a table, too."""
         chain, draw = np.indices(self.chains.log_density.shape)
-        return frame({name: np.ravel(x) for name, x in ({"chain": chain, "draw": draw} | self.quantities).items()})
+        return frame(
+            {
+                name: np.ravel(x)
+                for name, x in ({"chain": chain, "draw": draw} | self.quantities).items()
+            }
+        )
 
     def to_datatree(self) -> "xarray.DataTree":
-        """ArviZ's groups posterior, posterior_predictive, sample_stats, observed_data, over chain, draw, frequency."""
+        """ArviZ's groups posterior, posterior_predictive, sample_stats, observed_data, over chain,
+        draw, frequency."""
         return datatree(self)
 
     def save(self, path: str | Path) -> None:
-        """Write the draws as netCDF, or a summary as JSON if the name ends in .json; replaces a file in one step."""
+        """Write the draws as netCDF, or a summary as JSON if the name ends in .json; replaces a
+        file in one step."""
         if Path(path).suffix == ".json":
             write_json(path, summary_table(self))
         else:
             write_netcdf(path, self)
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
-        """Corner figure of what the data determine. Raises `NotMixedError` if the chains did not mix."""
+        """Corner figure of what the data determine. Raises `NotMixedError` if the chains did not
+        mix."""
         return plot.posterior(self, ax)
 
     def plot_chains(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
@@ -168,7 +197,8 @@ class Posterior(Shown, eqx.Module):
         return plot.chains(self, ax)
 
     def plot_predictive(self, ax: "Axes | None" = None, target: str | None = None) -> "Axes":
-        """The target (of several, the named one) among the spectra that the posterior predicts. Returns the axes."""
+        """The target (of several, the named one) among the spectra that the posterior predicts.
+        Returns the axes."""
         return plot.predictive(self, ax, target)
 
     def _card(self) -> Card:
@@ -180,16 +210,23 @@ class Posterior(Shown, eqx.Module):
     def _told(self) -> str:
         """The posterior in a few lines."""
         count, draws = self.chains.log_density.shape
-        lines = [f"{'posterior' if self.success else 'NO POSTERIOR'}: {self.title}, {self.model}", f"  {self.message}",
-                 f"  {count} chains of {draws} draws, {self.divergences} divergences"]  # fmt: skip
+        lines = [
+            f"{'posterior' if self.success else 'NO POSTERIOR'}: {self.title}, {self.model}",
+            f"  {self.message}",
+            f"  {count} chains of {draws} draws, {self.divergences} divergences",
+        ]
         if self.success:
             for name, part in self.parts.items():
                 whose = f"{name}: " if len(self.parts) > 1 else ""
-                lines.append(f"  {whose}posterior-predictive chi2: p = {part.replicates.p_value:.2g} (near 0: the model "
-                             "does not describe the data)")  # fmt: skip
+                lines.append(
+                    f"  {whose}posterior-predictive chi2: p = {part.replicates.p_value:.2g} (near"
+                    " 0: the model does not describe the data)"
+                )
             for name, modes in self.frequency_modes.items():
                 if len(modes) > 1:
-                    told = ", ".join(f"{middle:.2f} Hz ({100 * share:.0f} %)" for _, middle, _, share in modes)
+                    told = ", ".join(
+                        f"{middle:.2f} Hz ({100 * share:.0f} %)" for _, middle, _, share in modes
+                    )
                     lines.append(f"  {name} has several modes: {told}")
         return folded(lines)
 
@@ -206,25 +243,51 @@ class Summary(Shown, eqx.Module):
     def __getitem__(self, name: str) -> dict[str, float]:
         """What is known of one quantity. Raises `ValueError` for an unknown name."""
         if name not in self.rows:
-            raise ValueError(f"unknown quantity {name!r} of the posterior: {choices(name, self.rows)}")
+            raise ValueError(
+                f"unknown quantity {name!r} of the posterior: {choices(name, self.rows)}"
+            )
         keys = ("mean", "sd", "median", "low", "high", "r_hat", "ess_bulk", "ess_tail")
         return dict(zip(keys, (*self.rows[name], *self.diagnostics[name]), strict=True))
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row for each quantity: `quantity`, what `summary[name]` has (`mean` to `ess_tail`), `unit`, `determined`."""
-        return frame([{"quantity": n, **self[n], "unit": self.units[n], "determined": n in self.determined}
-                      for n in self.rows])  # fmt: skip
+        """A row for each quantity: `quantity`, what `summary[name]` has (`mean` to `ess_tail`),
+        `unit`, `determined`."""
+        return frame(
+            [
+                {
+                    "quantity": n,
+                    **self[n],
+                    "unit": self.units[n],
+                    "determined": n in self.determined,
+                }
+                for n in self.rows
+            ]
+        )
 
     def _card(self) -> Card:
         columns = ("quantity", "median", "2.5 %", "97.5 %", "R-hat", "ESS", "unit")
-        rows, lines = [], [self.title, f"  {'':<24}{'median':>10}{'2.5 %':>10}{'97.5 %':>10}{'R-hat':>7}{'ESS':>6}  unit"]
+        rows, lines = (
+            [],
+            [
+                self.title,
+                f"  {'':<24}{'median':>10}{'2.5 %':>10}{'97.5 %':>10}{'R-hat':>7}{'ESS':>6}  unit",
+            ],
+        )
         for name, (_, _, middle, low, high) in self.rows.items():
             r_hat, bulk, tail = self.diagnostics[name]
             mark = "" if name in self.determined else "*"
             unit = "" if self.units[name] == "1" else self.units[name]
-            cells = (f"{middle:.4g}", f"{low:.4g}", f"{high:.4g}", f"{r_hat:.3f}", f"{min(bulk, tail):.0f}")
+            cells = (
+                f"{middle:.4g}",
+                f"{low:.4g}",
+                f"{high:.4g}",
+                f"{r_hat:.3f}",
+                f"{min(bulk, tail):.0f}",
+            )
             rows.append((name + mark, *cells, unit))
-            numbers = "".join(f"{cell:>{wide}}" for cell, wide in zip(cells, (10, 10, 10, 7, 6), strict=True))
+            numbers = "".join(
+                f"{cell:>{wide}}" for cell, wide in zip(cells, (10, 10, 10, 7, 6), strict=True)
+            )
             lines.append(f"  {name + mark:<24}{numbers}  {unit}")
         said = ("* not determined by the data: it comes from the prior. Do not interpret it",)
         remarks = said * any(name not in self.determined for name in self.rows)
@@ -238,18 +301,31 @@ KEYS = ("r_hat", "ess_bulk", "ess_tail")
 def datatree(found: Any) -> "xarray.DataTree":
     """Groups posterior, posterior_predictive, sample_stats, observed_data.
 
-    With several targets the spectra are called "expected@target" and so on, over "frequency@target".
+    With several targets the spectra are called "expected@target" and so on, over
+    "frequency@target".
     """
     import xarray
 
     chains, draws = found.chains.log_density.shape
     axes = {"chain": np.arange(chains), "draw": np.arange(draws)}
     pair = ("chain", "draw")
-    named = {name: (pair, x, {"units": found.unit(name), "determined": int(name in found.determined)})
-             for name, x in found.quantities.items()}  # fmt: skip
+    named = {
+        name: (pair, x, {"units": found.unit(name), "determined": int(name in found.determined)})
+        for name, x in found.quantities.items()
+    }
     made = found.chains
-    stats = {"lp": made.log_density, "acceptance_rate": made.acceptance, "n_steps": made.steps, "diverging": made.diverging}
-    told = {"success": int(found.success), "message": found.message, "target": found.title, "seed": str(found.seed)}
+    stats = {
+        "lp": made.log_density,
+        "acceptance_rate": made.acceptance,
+        "n_steps": made.steps,
+        "diverging": made.diverging,
+    }
+    told = {
+        "success": int(found.success),
+        "message": found.message,
+        "target": found.title,
+        "seed": str(found.seed),
+    }
     told |= {f"version_{name}": number for name, number in found.versions.items()}
     bins, expected, drawn, measured = {}, {}, {}, {}
     for name, part in found.parts.items():
@@ -263,7 +339,9 @@ def datatree(found: Any) -> "xarray.DataTree":
         "/": xarray.Dataset(attrs=told),
         "/posterior": xarray.Dataset(named | expected, axes | bins),
         "/posterior_predictive": xarray.Dataset(drawn, axes | bins),
-        "/sample_stats": xarray.Dataset({name: (pair, x) for name, x in stats.items()}, axes, {"step_size": made.step_size}),
+        "/sample_stats": xarray.Dataset(
+            {name: (pair, x) for name, x in stats.items()}, axes, {"step_size": made.step_size}
+        ),
         "/observed_data": xarray.Dataset(measured, bins),
     }
     return xarray.DataTree.from_dict(groups)
@@ -280,13 +358,25 @@ def summary_table(found: Any) -> dict[str, Any]:
     rows = None
     if found.success:
         summary = found.summary()
-        rows = {n: summary[n] | {"unit": found.unit(n), "determined": n in found.determined} for n in summary.rows}
+        rows = {
+            n: summary[n] | {"unit": found.unit(n), "determined": n in found.determined}
+            for n in summary.rows
+        }
     single = len(found.parts) == 1
     keys = ("from_hz", "median_hz", "to_hz", "probability")
-    modes = {name: [dict(zip(keys, m, strict=True)) for m in modes] for name, modes in found.frequency_modes.items()}
+    modes = {
+        name: [dict(zip(keys, m, strict=True)) for m in modes]
+        for name, modes in found.frequency_modes.items()
+    }
     p_values = {name: part.replicates.p_value for name, part in found.parts.items()}
-    about = {name: {"target": part.target.name, "task": type(part.task).__name__, "noise": type(part.task.noise).__name__}
-             for name, part in found.parts.items()}  # fmt: skip
+    about = {
+        name: {
+            "target": part.target.name,
+            "task": type(part.task).__name__,
+            "noise": type(part.task.noise).__name__,
+        }
+        for name, part in found.parts.items()
+    }
     return {
         "format": 1,
         "success": found.success,
@@ -296,7 +386,9 @@ def summary_table(found: Any) -> dict[str, Any]:
         "diagnostics": {n: dict(zip(KEYS, d, strict=True)) for n, d in found.diagnostics.items()},
         "summary": rows,
         "modes": next(iter(modes.values()), []) if single else modes,
-        "predictive_p_value": None if not found.success else found.replicates.p_value if single else p_values,
+        "predictive_p_value": (
+            None if not found.success else found.replicates.p_value if single else p_values
+        ),
         "seed": found.seed,
         "settings": found.settings,
         "versions": found.versions,
