@@ -19,6 +19,7 @@ UNDRAWN = ("plot", "_common")
 HOLDS = {
     "commands": "the command line",
     "paper": "the paper reproduced",
+    "reports": "what results say",
     "uncertainty": "profile, posterior, what is known",
     "checks": "goodness of fit, bootstrap",
     "comparison": "which colour of noise",

@@ -16,7 +16,7 @@ import jaxmuscle as jm
 from jaxmuscle.commands.console import write_fit
 from jaxmuscle.commands.main import app
 from jaxmuscle.data._frequency_response_files import is_frequency_response
-from jaxmuscle.data._perturbed_target import LINEAR
+from jaxmuscle.data._perturbed import LINEAR
 from jaxmuscle.fits import _perturbed
 from jaxmuscle.fits._checks import reach_notices
 from jaxmuscle.fits._perturbed import seen_with

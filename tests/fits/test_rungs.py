@@ -12,10 +12,9 @@ from refits import without_intervals
 from scipy.optimize import brentq
 
 import jaxmuscle as jm
-from jaxmuscle.comparison._comparison import NEEDED
 from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._checks import mass_notices, twitch_notices
-from jaxmuscle.fits._ladder import Rung, _fewer, criterion, gains, passed_over, told_apart
+from jaxmuscle.fits._ladder import _fewer, criterion, told_apart
 from jaxmuscle.fits._part import Estimate
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._arguments import COEFFICIENTS, FitOptions, planned
@@ -203,43 +202,6 @@ def test_alike_is_said_and_different_is_said():
     assert "prefer the resonance" in told_apart(-100.0, -120.0)
 
 
-# --- what a part gains
-
-
-def tried(*aics: tuple[int, float], chosen: int) -> tuple[Rung, ...]:
-    """Models of these numbers and AICs; the chi² of each is a tenth of the distance of its AIC from
-    -100."""
-    return tuple(Rung(n, f"{n}", aic, 5.0, (aic + 100) / 10, 0.3, n == chosen) for n, aic in aics)
-
-
-def test_every_part_of_the_chosen_model_says_what_it_gains_over_the_poorer_one():
-    said = gains(tried((0, -10.0), (1, -60.0), (2, -59.5), (3, -90.0), chosen=2), describes=True)
-    assert said[:-1] == (
-        "with activation the AIC falls by 50.0 (chi2 per bin 4.00 instead of 9.00)",
-        (
-            "with tremor instead of the harmonic the AIC rises by 0.5 (chi2 per bin 4.05 instead of"
-            " 4.00)"
-        ),
-    )
-    assert "A richer model can fit worse here" in said[-1]
-    assert (
-        f"2 or less says nothing. jaxmuscle compare is stricter: it needs at least {NEEDED:g}, and"
-        in said[-1]
-    )
-    assert "no p-value" in said[-1] and "No model" not in said[-1]
-
-
-def test_what_a_part_gains_is_counted_from_the_best_model_without_it():
-    worse = gains(tried((0, -60.0), (1, -50.0), (2, -90.0), chosen=2), describes=True)
-    assert worse[:-1] == (
-        "with activation the AIC rises by 10.0 (chi2 per bin 5.00 instead of 4.00)",
-        (
-            "with tremor instead of the harmonic the AIC falls by 30.0 against the best model"
-            " before (0) (chi2 per bin 1.00 instead of 4.00)"
-        ),
-    )
-
-
 def test_an_active_mass_far_from_its_prior_is_told():
     names, one = ("k_w", "m_w"), np.ones(2)
     coordinates = Coordinates.of({"k_w": 5e5, "m_w": 0.5}, {}, {"k_w": 1.0, "m_w": 0.5})
@@ -248,40 +210,6 @@ def test_an_active_mass_far_from_its_prior_is_told():
     # 0.5 exp(5/2)
     assert said.startswith("m_w went to 6.1 kg, 5 standard deviations of its prior from the 0.5 kg")
     assert mass_notices(coordinates, 2.9 * one) == ()
-
-
-def test_a_model_that_is_missing_in_the_table_is_explained():
-    (said,) = passed_over(tried((0, -10.0), (2, -60.0), chosen=2))
-    assert (
-        said
-        == "model 0 already describes the data, so model 1 was not tried. But the harmonic of model"
-        " 0 is significant (p < 0.05) and may be a tremor, so model 2 was tried as well"
-    )
-    assert passed_over(tried((0, -10.0), (1, -20.0), chosen=1)) == ()
-    failed = tuple(rung._replace(p=0.001) for rung in tried((0, -10.0), (2, -60.0), chosen=2))
-    assert passed_over(failed) == ()  # it was tried, and had no finite spectrum
-
-
-def test_what_was_not_tried_is_counted_with_the_next_model():
-    gain, _ = gains(tried((0, -10.0), (2, -60.0), chosen=2), describes=True)
-    assert gain.startswith(
-        "with activation and with tremor instead of the harmonic the AIC falls by 50.0 ("
-    )
-    gain, _ = gains(tried((-1, -10.0), (0, -20.0), chosen=0), describes=True)
-    assert gain.startswith("with a harmonic the AIC falls by 10.0 (")
-
-
-def test_nothing_is_gained_where_the_simplest_model_was_chosen_or_only_one_was_fitted():
-    assert gains(tried((0, -10.0), (2, -10.5), chosen=0), describes=True) == ()
-    assert gains(tried((2, -10.0), chosen=2), describes=True) == gains((), describes=None) == ()
-
-
-def test_where_no_model_describes_the_data_a_lower_aic_does_not_show_a_part():
-    *_, meaning = gains(tried((0, -10.0), (1, -60.0), chosen=1), describes=False)
-    assert (
-        "No model that was tried describes the data" in meaning
-        and "not that the muscle has this part" in meaning
-    )
 
 
 # --- is the twitch one of human muscle?

@@ -12,6 +12,7 @@ import jaxmuscle as jm
 from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.names import file_names
 from jaxmuscle._common.progress import told
+from jaxmuscle.reports import REPORT, cohort_report
 
 from .console import (
     BAD_INPUT,
@@ -26,7 +27,6 @@ from .console import (
     write_fit,
 )
 from .options import TaskName
-from .reports import REPORT, cohort_report
 
 if TYPE_CHECKING:
     from jaxmuscle.fits import CohortResult

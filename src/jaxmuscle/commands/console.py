@@ -284,8 +284,7 @@ def write_fit(
     there; their names."""
     from jaxmuscle._common.figures import remove_figures, write_figure
     from jaxmuscle._common.files import remove, write_text
-
-    from .reports import REPORT, fit_report
+    from jaxmuscle.reports import REPORT, fit_report
 
     tables = fit_tables(result)
     earlier = [

@@ -128,8 +128,7 @@ def posterior(
 def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
     from jaxmuscle._common.figures import pixels_of, remove_figures, write_figure
     from jaxmuscle._common.names import file_names
-
-    from .reports import posterior_report
+    from jaxmuscle.reports import posterior_report
 
     earlier = [f"predictive-{name}" for name in parts_of(folder / "posterior.json")]
     remove_figures(folder, "corner", "predictive", *earlier)

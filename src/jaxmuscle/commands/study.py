@@ -92,8 +92,7 @@ def study(
     """
     with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
-
-        from .reports import study_report
+        from jaxmuscle.reports import study_report
 
         keep_compiled_programs()
         span = edges_of(window)

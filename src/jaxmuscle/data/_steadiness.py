@@ -22,8 +22,7 @@ from jaxmuscle.spectra._measures import regularity
 from jaxmuscle.spectra._settings import require
 
 from ._measure import Measure, likelier_error, log_interval, logit_interval, student_interval
-from ._pooled import notices_of, unlike
-from ._recording import RECORDED, SEGMENTS, SHORTEST, Recording
+from ._recording import RECORDED, SEGMENTS, SHORTEST, Recording, notices_of, unlike
 
 if TYPE_CHECKING:
     import pandas

@@ -13,8 +13,7 @@ from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum
 
-from ._pooled import notices_of, pooled_target
-from ._recording import Recording, recorded_settings
+from ._recording import Recording, notices_of, pooled_target, recorded_settings
 from ._recording_files import load_columns, load_recording
 from ._recording_table import Table
 from ._target import Target

@@ -8,11 +8,10 @@ import equinox as eqx
 import numpy as np
 
 from jaxmuscle import plot
-from jaxmuscle._common.cards import Card, Result, in_columns
+from jaxmuscle._common.cards import Card, Result, reports
 from jaxmuscle._common.environment import fitting, versions
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.tables import frame
-from jaxmuscle._common.text import folded
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
@@ -89,22 +88,7 @@ class CohortResult(Result, eqx.Module):
         )
 
     def _card(self) -> Card:
-        columns = ("target", "group", "in words")
-        rows = [
-            (name, self.groups.get(name, ""), result.verdict)
-            for name, result in self.results.items()
-        ]
-        rows += [
-            (name, self.groups.get(name, ""), f"not fitted: {why}")
-            for name, why in self.failed.items()
-        ]
-        heading = f"{len(rows)} targets: {self.verdict}"
-        return Card(
-            "\n".join([folded([heading]), *in_columns(columns, rows)]),
-            heading,
-            columns,
-            tuple(rows),
-        )
+        return reports().cohort_card(self)
 
     def table(self) -> list[dict[str, Any]]:
         """Tidy rows, one per target and quantity (free parameters, then derived ones), with the

@@ -1,24 +1,18 @@
-"""What `fit.json` holds: the schema of its keys, and whether they agree with each other."""
+"""What `fit.json` holds: the schema of its keys."""
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
-from jaxmuscle._common.documents import Table, contradiction, says
+from jaxmuscle._common.documents import Table, says
 from jaxmuscle._common.keys import SEEDS
 from jaxmuscle.data._target import Target
-from jaxmuscle.objective._arguments import METHODS, RESIDUALS, base_of, target_of
-
-if TYPE_CHECKING:
-    from ._result import FitResult
+from jaxmuscle.objective._arguments import METHODS, RESIDUALS
 
 FORMAT = 4
 # that can be read; 2 may leave out what task and target do not have, 3 where starts ended
 FORMATS = (2, 3, 4)
-SAME = 1e-9  # relative
 
 Number = float | None  # null where it is not finite
 Numbers = list[Number]
@@ -307,66 +301,6 @@ class FitTable(Table, kw_only=True):
     versions: Annotated[dict[str, str], says("Versions of the libraries")]
 
 
-def disagreement(result: "FitResult") -> str | None:
-    """In words, where parts of a result contradict each other that are not made from each other;
-    None if nowhere."""
-    settings, free = result.settings, set(result.free)
-    for key in ("free", "prior_centre", "prior_sd"):
-        if set(settings[key]) != free:
-            return (
-                f"settings.{key} names {_names(settings[key])}, but free among the parameters are"
-                f" {_names(free)}"
-            )
-    if any(len(start.values) not in (0, len(free)) for start in result.starts):
-        return f"starts: values needs a number for each of {_names(free)}"
-    if not set(settings["bounds"]) <= free:
-        return f"settings.bounds names {_names(settings['bounds'])}, but free are {_names(free)}"
-    if len(result.parts) > 1 and not {"separate", "proportional"} <= set(settings):
-        return (
-            "settings has no key 'separate' or 'proportional', which the fit of several targets has"
-        )
-    spectra = {name: part.target.settings.to_dict() for name, part in result.parts.items()}
-    used = (
-        settings["spectrum"]
-        if len(spectra) > 1
-        else {name: settings["spectrum"] for name in spectra}
-    )
-    if differs := contradiction(used, spectra, "settings.spectrum"):
-        return differs
-    of = result.correlation
-    if len(of) == 1 or (
-        of
-        and (len(of["matrix"]), *map(len, of["matrix"]))
-        != (len(of["parameters"]),) * (1 + len(of["parameters"]))
-    ):
-        return "correlation.matrix needs a row and a column for each of correlation.parameters"
-    if result.profile is not None and len(result.profile[0]) != len(result.profile[1]):
-        return "profile.chi2_rise needs a number for each of profile.frequency_hz"
-    return _values(result)
-
-
-def _values(result: "FitResult") -> str | None:
-    """Parameters against the tasks that have them."""
-    for name, estimate in result.parameters.items():
-        base, own = base_of(name), target_of(name)
-        if own and own not in result.tasks:
-            return f"parameters.{name}: there is no target {own!r}"
-        tasks = (
-            [result.tasks[own]]
-            if own
-            else [task for task in result.tasks.values() if base in task.parameter_names]
-        )
-        if not tasks or base not in tasks[0].parameter_names:
-            return f"parameters.{name}: no task has this parameter"
-        value = float(tasks[0][base])
-        if np.isfinite(estimate.value) and not np.isclose(value, estimate.value, rtol=SAME, atol=0):
-            return f"parameters.{name}.value is {estimate.value!r}, but {value!r} in the task_table"
-    missing = {name for task in result.tasks.values() for name in task.parameter_names} - set(
-        map(base_of, result.parameters)
-    )
-    return f"parameters has no key {sorted(missing)[0]!r}, which the task has" if missing else None
-
-
 def check_lengths(table: PartTable, target: Target) -> None:
     """Raise a `ValueError` for columns that have not a number for each bin, or for each time."""
     spectrum, bins = table.spectrum, len(target.bins)
@@ -386,7 +320,3 @@ def check_lengths(table: PartTable, target: Target) -> None:
             f"stiffness has {len(real)} real and {len(imaginary)} imaginary parts, the target"
             f" {known}"
         )
-
-
-def _names(names: Iterable[str]) -> str:
-    return ", ".join(sorted(names)) or "none"

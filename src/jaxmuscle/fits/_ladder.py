@@ -1,7 +1,6 @@
 """The ladder: richer models, one after the other, until one describes the data."""
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,7 +9,6 @@ from jaxtyping import Float
 
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
-from jaxmuscle._common.text import probability
 from jaxmuscle.model._noise import NoiseSum
 from jaxmuscle.model._parameters import HARMONIC, default
 from jaxmuscle.model._resonant_noise import ResonantNoise
@@ -29,7 +27,6 @@ STARTS = 32
 ALIKE = 2.0
 TREMOR = 2  # the rung whose rhythm is no line
 DESCENDED = 0.6  # a fit's progress when its descents have ended
-HEAD = "models tried, by formula alone (-> the result)"
 
 
 class Rung(NamedTuple):
@@ -47,15 +44,6 @@ class Rung(NamedTuple):
     p: float
     chosen: bool = False
 
-    @property
-    def p_in_words(self) -> str:
-        """As it stands in a table: "<= 0.001" for the least that replicates can show."""
-        return probability(self.p).removeprefix("p ").removeprefix("= ")
-
-    def __str__(self) -> str:
-        numbers = f"{self.chi2_per_bin:>9.2f}{self.p_in_words:>9}{self.aic:>9.1f}"
-        return f"{'->' if self.chosen else '  '} {self.number} {self.model:<42}{numbers}"
-
 
 class Climbed(NamedTuple):
     """A rung that was fitted: its plan, the stages of its search, what is known of the scatter,
@@ -66,71 +54,6 @@ class Climbed(NamedTuple):
     known: Any
     ended: Endpoint
     rung: Rung
-
-
-def heading(datum: str) -> str:
-    """The head of the table of models; `datum`, what chi² is counted for: a bin, or else any number
-    of the data."""
-    return f"{HEAD:<46}{f'chi2/{datum}':>10}{'p':>9}{'AIC':>9}"
-
-
-def gains(
-    ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin"
-) -> tuple[str, ...]:
-    """What every part of the chosen model gains over the best model without it, in sentences; and
-    what such a number says.
-
-    `describes`: whether the chosen model describes the data; `datum`, what chi² is counted for.
-    """
-    number = next((rung.number for rung in ladder if rung.chosen), QUIET)
-    climbed = tuple(rung for rung in ladder if rung.number <= number)
-    said = tuple(_gain(climbed[:i], after, datum) for i, after in enumerate(climbed) if i)
-    if not said:
-        return ()
-    meaning = (
-        "the AIC weighs how well a model fits against its number of parameters: lower is better. A"
-        f" difference of {ALIKE:g} or less says nothing. jaxmuscle compare is stricter: it needs at"
-        " least 6, and the richer model must also predict bins better that were left out of its"
-        " fit. The AIC is no p-value"
-    )
-    if any(after.aic > before.aic for before, after in itertools.pairwise(climbed)) and number > 0:
-        meaning += (
-            ". A richer model can fit worse here, since models with activation or tremor keep"
-            " stiffness and damping nearer to their usual values"
-        )
-    if describes is False:
-        meaning += (
-            ". No model that was tried describes the data: then a lower AIC says that a model"
-            " misses less, not that the muscle has this part"
-        )
-    return (*said, meaning)
-
-
-def passed_over(ladder: tuple[Rung, ...]) -> tuple[str, ...]:
-    """Which models between those of a table are missing there, and why, in sentences."""
-    return tuple(
-        f"model {before.number} already describes the data, so model {number} was not tried. But"
-        f" the harmonic of model {before.number} is significant (p < {SIGNIFICANT:g}) and may be a"
-        f" tremor, so model {after.number} was tried as well"
-        for before, after in itertools.pairwise(ladder)
-        if before.p >= ADEQUATE
-        for number in range(before.number + 1, after.number)
-    )
-
-
-def _gain(poorer: tuple[Rung, ...], after: Rung, datum: str) -> str:
-    """AIC and chi² of a model against those of the best of the poorer ones."""
-    last, best = poorer[-1], min(poorer, key=lambda rung: rung.aic)
-    added = " and ".join(
-        "with a harmonic" if n == 0 else rung_name(n)
-        for n in range(last.number + 1, after.number + 1)
-    )
-    change = after.aic - best.aic
-    against = "" if best is last else f" against the best model before ({best.model})"
-    return (
-        f"{added} the AIC {'falls' if change < 0 else 'rises'} by {abs(change):.1f}{against} (chi2"
-        f" per {datum} {after.chi2_per_bin:.2f} instead of {best.chi2_per_bin:.2f})"
-    )
 
 
 def options_for(task: AbstractTask, options: FitOptions) -> FitOptions:

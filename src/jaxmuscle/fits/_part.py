@@ -1,6 +1,7 @@
 """What a fit found of one target, and numbers with their errors: as objects and as tables."""
 
 import math
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,8 @@ from jaxmuscle._common.text import rounded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
+from jaxmuscle.objective._arguments import base_of
+from jaxmuscle.objective._covariance import spelt
 
 from ._fit_file import EstimateTable, PartTable, check_lengths
 
@@ -22,6 +25,19 @@ if TYPE_CHECKING:
     import pandas
 
 MISSED = 3.0  # standard deviations
+RELATIVE = {
+    "N": "1",
+    "N/m": "1/m",
+    "N s/m": "s/m",
+    "N/m^3": "1/m^3",
+    "N s^3/m^3": "s^3/m^3",
+    "kg": "kg/N",
+}
+ALIASES = {
+    "resonance_frequency": "tremor_frequency",
+    "resonance_width": "tremor_width",
+    "activation_time": "contraction_time",
+}
 SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
 
 
@@ -233,6 +249,47 @@ class FittedPart(eqx.Module):
                 f" formula by at most {off:.2g} % of a bin"
             ),
         )
+
+
+def as_people_say(product: str) -> str:
+    """A product of parameters by the names of the table above it."""
+    return re.sub(r"\w+", lambda word: in_use(word[0]) or word[0], spelt(product))
+
+
+def in_use(name: str) -> str | None:
+    """The name that people use for a parameter, of one target or "name@target"; None where that is
+    its own."""
+    base, at, target = name.partition("@")
+    return ALIASES[base] + at + target if base in ALIASES else None
+
+
+def once(
+    parameters: Mapping[str, Estimate], derived: Mapping[str, Estimate]
+) -> dict[str, Estimate]:
+    """Parameters and derived quantities; what is both, once, by the name that people use."""
+    return {name: p for name, p in parameters.items() if in_use(name) not in derived} | dict(
+        derived
+    )
+
+
+def per_newton(table: Mapping[str, Estimate], mean: float) -> dict[str, Estimate]:
+    """The table with whatever has newtons (or masses, which go with them) over the mean force;
+    without that itself."""
+    return {
+        n: _over(p, mean) if p.unit in RELATIVE else p
+        for n, p in table.items()
+        if base_of(n) != "mean"
+    }
+
+
+def _over(p: Estimate, mean: float) -> Estimate:
+    def over(value: float | None) -> float | None:
+        return None if value is None else value / mean
+
+    interval = None if p.interval is None else (over(p.interval[0]), over(p.interval[1]))
+    return Estimate(
+        p.value / mean, RELATIVE[p.unit], over(p.stderr), p.free, p.identifiable, interval
+    )
 
 
 def estimates_to_table(table: dict[str, Estimate]) -> dict[str, Any]:

@@ -10,8 +10,7 @@ import numpy as np
 
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._frequency_response import UNSEEN, check_seen
-from jaxmuscle.data._perturbed import PerturbedRecording
-from jaxmuscle.data._perturbed_target import perturbed_target
+from jaxmuscle.data._perturbed import PerturbedRecording, perturbed_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.data._two_channels import perturbed_recordings
 from jaxmuscle.model._parameters import HARMONIC

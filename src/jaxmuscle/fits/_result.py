@@ -2,7 +2,7 @@
 cannot say."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import from_nulls, with_nulls
-from jaxmuscle._common.cards import Card, Result
+from jaxmuscle._common.cards import Card, Result, reports
 from jaxmuscle._common.documents import checked, contradiction, converted, parsed
 from jaxmuscle._common.errors import ResultError
 from jaxmuscle._common.files import expanded, write_json
@@ -23,23 +23,25 @@ from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.objective._arguments import base_of, target_of
 from jaxmuscle.objective._derived import derived_names
 
 from ._adequacy import Adequacy
-from ._fit_file import FORMAT, FORMATS, FitTable, PartTable, disagreement
+from ._fit_file import FORMAT, FORMATS, FitTable, PartTable
 from ._ladder import Rung
-from ._methods import methods_of_fit
 from ._part import (
     Estimate,
     FittedPart,
     Start,
     estimates_to_table,
+    in_use,
     met,
+    once,
     part_to_table,
+    per_newton,
     read_estimates,
     read_part,
 )
-from ._result_text import WHAT_TO_DO, card_of, in_use, once, per_newton
 
 if TYPE_CHECKING:
     import pandas
@@ -47,6 +49,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
+WHAT_TO_DO = (
+    "what to do: do not interpret the parameters. Report that the model does not describe the data,"
+    " and report none of its numbers. What needs no model (mean, variation, power by band, the peak"
+    " of a tremor) comes from `jaxmuscle steadiness`. To go on, look at the residuals in the"
+    " figure, and whether the recording drifts. `jaxmuscle compare fit.json` tries other noises; it"
+    " takes as long as all fits so far"
+)
+SAME = 1e-9  # relative, of a number that stands twice in a file
 PROFILE = ("frequency_hz", "chi2_rise")
 
 
@@ -292,7 +302,7 @@ class FitResult(Result, eqx.Module):
     def methods(self) -> str | None:
         """A paragraph for the methods section of a paper; None for several targets, a moved
         insertion, a failed fit."""
-        return methods_of_fit(self)
+        return reports().fit_methods(self)
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The figure of the fit."""
@@ -309,7 +319,7 @@ class FitResult(Result, eqx.Module):
         return per_newton(table, self.derived["mean"].value) if self.per_newton else dict(table)
 
     def _card(self) -> Card:
-        return card_of(self)
+        return reports().fit_card(self)
 
 
 def to_table(result: FitResult) -> dict[str, Any]:
@@ -373,7 +383,7 @@ def load_result(path: str | Path) -> FitResult:
         # What can be made from the rest of the file must be what the file says; words may have
         # changed since.
         stated = {**table, "format": FORMAT, "verdict": result.verdict}
-        wrong = disagreement(result) or contradiction(
+        wrong = _disagreement(result) or contradiction(
             stated, to_table(result), whole=table["format"] == FORMAT
         )
     except (ValueError, ArithmeticError) as error:
@@ -431,3 +441,67 @@ def _from_table(table: dict[str, Any], file: str) -> FitResult:
         settings=table["settings"],
         versions=said.versions,
     )
+
+
+def _disagreement(result: FitResult) -> str | None:
+    """In words, where parts of a result contradict each other that are not made from each other;
+    None if nowhere."""
+    settings, free = result.settings, set(result.free)
+    for key in ("free", "prior_centre", "prior_sd"):
+        if set(settings[key]) != free:
+            return (
+                f"settings.{key} names {_names(settings[key])}, but free among the parameters are"
+                f" {_names(free)}"
+            )
+    if any(len(start.values) not in (0, len(free)) for start in result.starts):
+        return f"starts: values needs a number for each of {_names(free)}"
+    if not set(settings["bounds"]) <= free:
+        return f"settings.bounds names {_names(settings['bounds'])}, but free are {_names(free)}"
+    if len(result.parts) > 1 and not {"separate", "proportional"} <= set(settings):
+        return (
+            "settings has no key 'separate' or 'proportional', which the fit of several targets has"
+        )
+    spectra = {name: part.target.settings.to_dict() for name, part in result.parts.items()}
+    used = (
+        settings["spectrum"]
+        if len(spectra) > 1
+        else {name: settings["spectrum"] for name in spectra}
+    )
+    if differs := contradiction(used, spectra, "settings.spectrum"):
+        return differs
+    of = result.correlation
+    if len(of) == 1 or (
+        of
+        and (len(of["matrix"]), *map(len, of["matrix"]))
+        != (len(of["parameters"]),) * (1 + len(of["parameters"]))
+    ):
+        return "correlation.matrix needs a row and a column for each of correlation.parameters"
+    if result.profile is not None and len(result.profile[0]) != len(result.profile[1]):
+        return "profile.chi2_rise needs a number for each of profile.frequency_hz"
+    return _values(result)
+
+
+def _values(result: FitResult) -> str | None:
+    """Parameters against the tasks that have them."""
+    for name, estimate in result.parameters.items():
+        base, own = base_of(name), target_of(name)
+        if own and own not in result.tasks:
+            return f"parameters.{name}: there is no target {own!r}"
+        tasks = (
+            [result.tasks[own]]
+            if own
+            else [task for task in result.tasks.values() if base in task.parameter_names]
+        )
+        if not tasks or base not in tasks[0].parameter_names:
+            return f"parameters.{name}: no task has this parameter"
+        value = float(tasks[0][base])
+        if np.isfinite(estimate.value) and not np.isclose(value, estimate.value, rtol=SAME, atol=0):
+            return f"parameters.{name}.value is {estimate.value!r}, but {value!r} in the task_table"
+    missing = {name for task in result.tasks.values() for name in task.parameter_names} - set(
+        map(base_of, result.parameters)
+    )
+    return f"parameters has no key {sorted(missing)[0]!r}, which the task has" if missing else None
+
+
+def _names(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names)) or "none"

@@ -16,14 +16,14 @@ import numpy as np
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
-from jaxmuscle._common.cards import Printed, Result
+from jaxmuscle._common.cards import Card, Result, reports
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.figures import remove_figures, write_figure
 from jaxmuscle._common.files import remove, write_json, write_text
 from jaxmuscle._common.keys import check_key
 from jaxmuscle._common.progress import Tell, told
 from jaxmuscle._common.tables import frame
-from jaxmuscle._common.text import WIDTH, choices, folded
+from jaxmuscle._common.text import WIDTH, choices
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_study
 from jaxmuscle.model._parameters import PARAMETERS
@@ -32,10 +32,7 @@ from jaxmuscle.objective._derived import DERIVED
 
 from ._cohort import CohortResult, fit_cohort
 from ._differences import CORRECTIONS, Difference, change, corrected, difference, paired
-from ._methods import methods_of_study
-from ._part import Estimate, estimates_to_table
-from ._result_text import ALIASES
-from ._study_words import report_lines
+from ._part import ALIASES, Estimate, estimates_to_table
 
 if TYPE_CHECKING:
     import pandas
@@ -49,7 +46,7 @@ FORMAT = 1
 COMPARED = tuple(name for name in DERIVED if name != "high_frequency_floor")
 
 
-class StudyResult(Printed, Result, eqx.Module):
+class StudyResult(Result, eqx.Module):
     """What a study found.
 
     `cohort`, the fits, one of each person in each condition; `cells`, one for each of them:
@@ -182,7 +179,7 @@ class StudyResult(Printed, Result, eqx.Module):
     def methods(self) -> str:
         """A paragraph for the methods section of a paper: people, recordings, spectra, model,
         statistics, versions."""
-        return methods_of_study(self)
+        return reports().study_methods(self)
 
     def plot(self, ax: "Axes | None" = None, *, proportional: bool = True) -> "Figure | SubFigure":
         """Spectra of people and means of groups, a panel for each condition; see
@@ -225,8 +222,8 @@ class StudyResult(Printed, Result, eqx.Module):
         for name, figure in figures.items():
             write_figure(figure, folder, name, formats)
 
-    def __str__(self) -> str:
-        return folded(report_lines(self))
+    def _card(self) -> Card:
+        return reports().study_card(self)
 
 
 FILES = ("people.csv", "differences.csv", "study.json", "methods.txt")

@@ -12,7 +12,7 @@ from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import replacing, write_json
 from jaxmuscle._common.text import folded
-from jaxmuscle.data._perturbed_target import MARGIN
+from jaxmuscle.data._perturbed import MARGIN
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._derived import TANGENTS
 

@@ -15,7 +15,7 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
-from jaxmuscle.fits._result_text import ALIASES, RELATIVE, as_people_say
+from jaxmuscle.fits._part import ALIASES, RELATIVE, as_people_say
 from jaxmuscle.objective._covariance import DETERMINED
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from ._study_words import counted, people_in_words, range_of, trials_in_words
+from ._study_text import counted, people_in_words, range_of, trials_in_words
 
 if TYPE_CHECKING:
-    from ._result import FitResult
-    from ._study import StudyResult
+    from jaxmuscle.fits._result import FitResult
+    from jaxmuscle.fits._study import StudyResult
 
 NAMES = {
     "holm": "Holm's method, which bounds the chance of any false positive",
@@ -39,7 +39,7 @@ TESTS = {
 WINDOWED = re.compile(r"([\d.]+) Hz, window ([\d.]+) s to ([\d.]+) s")  # in the source of a target
 
 
-def methods_of_study(study: "StudyResult") -> str:
+def study_methods(study: "StudyResult") -> str:
     """People, recordings, spectra, model, fit, statistics and versions, in sentences."""
     s = study.cells[0].target.settings
     window = study.options["reading"].get("window")
@@ -82,7 +82,7 @@ def methods_of_study(study: "StudyResult") -> str:
     return " ".join(said)
 
 
-def methods_of_fit(result: "FitResult") -> str | None:
+def fit_methods(result: "FitResult") -> str | None:
     """Data, spectrum, model, fit, verdict, what was assumed, versions; None for several targets and
     a moved insertion."""
     if (

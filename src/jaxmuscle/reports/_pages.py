@@ -9,9 +9,13 @@ from typing import TYPE_CHECKING, Any
 from jaxmuscle._common import pages
 from jaxmuscle._common.pages import Html
 
+from ._ladder_text import format_p
+
 if TYPE_CHECKING:
-    from jaxmuscle.fits import CohortResult, FitResult, StudyResult
-    from jaxmuscle.uncertainty import Posterior
+    from jaxmuscle.fits._cohort import CohortResult
+    from jaxmuscle.fits._result import FitResult
+    from jaxmuscle.fits._study import StudyResult
+    from jaxmuscle.uncertainty._posterior import Posterior
 
 REPORT = "report.html"
 WOULD = "What the data would determine if the model held"
@@ -96,7 +100,7 @@ def _tried(result: "FitResult") -> list[Html]:
             str(rung.number),
             rung.model,
             f"{rung.chi2_per_bin:.2f}",
-            rung.p_in_words,
+            format_p(rung.p),
             f"{rung.aic:.1f}",
             "the result" if rung.chosen else "",
         )

@@ -3,18 +3,23 @@
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+from jaxmuscle._common.cards import Card
+from jaxmuscle._common.text import folded
+from jaxmuscle.fits._differences import Difference
 from jaxmuscle.model._rungs import RUNGS
 
-from ._differences import Difference
-
 if TYPE_CHECKING:
-    from ._study import StudyResult
+    from jaxmuscle.fits._study import StudyResult
 
 MOST = 12  # comparisons on a terminal
 
 
-def report_lines(study: "StudyResult") -> list[str]:
+def study_card(study: "StudyResult") -> Card:
     """What a terminal shows."""
+    return Card(folded(_lines(study)))
+
+
+def _lines(study: "StudyResult") -> list[str]:
     cohort, found = study.cohort, sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))
     alpha = study.options["alpha"]
     clear = [d for d in found if d.p_corrected is not None and d.p_corrected < alpha]

@@ -14,7 +14,7 @@ import jaxmuscle as jm
 from jaxmuscle._common.figures import pixels_of
 from jaxmuscle.commands import cohort as cohort_command
 from jaxmuscle.commands.console import write_fit
-from jaxmuscle.commands.reports import fit_report, posterior_report, study_report
+from jaxmuscle.reports import fit_report, posterior_report, study_report
 
 
 @pytest.fixture(autouse=True)

@@ -1,53 +1,28 @@
-"""The result of a fit as text."""
+"""The result of a fit as text, and as a table in a notebook."""
 
-import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
+from jaxmuscle.fits._part import RELATIVE, Estimate, FittedPart, as_people_say, once
+from jaxmuscle.fits._result import FitResult
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._covariance import spelt
 from jaxmuscle.objective._derived import MEANINGS
 from jaxmuscle.spectra._fluctuations import BANDS, in_bands
 
-from ._ladder import gains, heading, passed_over
-from ._part import Estimate, FittedPart
+from ._ladder_text import gain_sentences, ladder_table, skipped_models
 
-if TYPE_CHECKING:
-    from ._result import FitResult
-
-RELATIVE = {
-    "N": "1",
-    "N/m": "1/m",
-    "N s/m": "s/m",
-    "N/m^3": "1/m^3",
-    "N s^3/m^3": "s^3/m^3",
-    "kg": "kg/N",
-}
-ALIASES = {
-    "resonance_frequency": "tremor_frequency",
-    "resonance_width": "tremor_width",
-    "activation_time": "contraction_time",
-}
 LENGTHS = ("x_ref_w", "x_ref_z")
 OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
 BROAD = 1.7 * 3.92  # standard errors: an interval that is wider than theirs
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
-WHAT_TO_DO = (
-    "what to do: do not interpret the parameters. Report that the model does not describe the data,"
-    " and report none of its numbers. What needs no model (mean, variation, power by band, the peak"
-    " of a tremor) comes from `jaxmuscle steadiness`. To go on, look at the residuals in the"
-    " figure, and whether the recording drifts. `jaxmuscle compare fit.json` tries other noises; it"
-    " takes as long as all fits so far"
-)
 
 
-def card_of(result: "FitResult") -> Card:
+def fit_card(result: FitResult) -> Card:
     """The result as text, and as a table of all its numbers: those that the data determine first,
     then what was fixed."""
     rows = []
@@ -71,10 +46,10 @@ def card_of(result: "FitResult") -> Card:
         *result.remarks,
         *_held(result),
     )
-    return Card(text_of(result), _heading(result), COLUMNS, tuple(rows), remarks)
+    return Card(_text(result), _heading(result), COLUMNS, tuple(rows), remarks)
 
 
-def _heading(result: "FitResult") -> str:
+def _heading(result: FitResult) -> str:
     """The verdict as a sentence of its own."""
     if not result.success:
         return result.verdict[0].upper() + result.verdict[1:]
@@ -82,7 +57,7 @@ def _heading(result: "FitResult") -> str:
     return f"{subject} {result.verdict}"
 
 
-def text_of(result: "FitResult") -> str:
+def _text(result: FitResult) -> str:
     """The verdict, what the data determine and what they do not, and what to know about it."""
     single = len(result.parts) == 1
     lines = [_heading(result), f"  {_head(result)}"]
@@ -97,12 +72,8 @@ def text_of(result: "FitResult") -> str:
         for name, p in result.parts.items()
         for words in _trials(p.target)
     ]
-    lines += (
-        [f"  {heading(_datum(result))}", *(f"  {rung}" for rung in result.ladder)]
-        if len(result.ladder) > 1
-        else []
-    )
-    lines += [f"  {sentence}" for sentence in passed_over(result.ladder)]
+    lines += [f"  {row}" for row in ladder_table(result.ladder, _datum(result))]
+    lines += [f"  {sentence}" for sentence in skipped_models(result.ladder)]
     lines += [f"  {sentence}" for sentence in _gains(result)]
     lines += [f"  {sentence}" for sentence in result.advice]
     lines += [f"  note: {notice}" for notice in result.notices]
@@ -161,7 +132,7 @@ def text_of(result: "FitResult") -> str:
     return folded(lines)
 
 
-def _held(result: "FitResult") -> list[str]:
+def _held(result: FitResult) -> list[str]:
     """The masses and lengths that a fit takes as given, where its stiffness in newtons depends on
     them."""
     whose = next((name for name, part in result.parts.items() if part.stiffness is not None), None)
@@ -227,30 +198,10 @@ def _held(result: "FitResult") -> list[str]:
     return said
 
 
-def _per_newton(result: "FitResult", shown: Mapping[str, Estimate]) -> str:
+def _per_newton(result: FitResult, shown: Mapping[str, Estimate]) -> str:
     """What the heading of a table says if numbers in it are no newtons."""
     there = result.per_newton and any(result[name].unit in RELATIVE for name in shown)
     return " (per newton of mean force)" * bool(there)
-
-
-def per_newton(table: Mapping[str, Estimate], mean: float) -> dict[str, Estimate]:
-    """The table with whatever has newtons (or masses, which go with them) over the mean force;
-    without that itself."""
-    return {
-        n: _over(p, mean) if p.unit in RELATIVE else p
-        for n, p in table.items()
-        if base_of(n) != "mean"
-    }
-
-
-def _over(p: Estimate, mean: float) -> Estimate:
-    def over(value: float | None) -> float | None:
-        return None if value is None else value / mean
-
-    interval = None if p.interval is None else (over(p.interval[0]), over(p.interval[1]))
-    return Estimate(
-        p.value / mean, RELATIVE[p.unit], over(p.stderr), p.free, p.identifiable, interval
-    )
 
 
 def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str]:
@@ -325,7 +276,7 @@ def _is_broad(p: Estimate) -> bool:
     )
 
 
-def _by_band(result: "FitResult", table: dict[str, Estimate]) -> list[str]:
+def _by_band(result: FitResult, table: dict[str, Estimate]) -> list[str]:
     """The shares of power in bands, of fit and data, a sentence for each target."""
     sentences = []
     for name, part in result.parts.items():
@@ -350,7 +301,7 @@ def _by_band(result: "FitResult", table: dict[str, Estimate]) -> list[str]:
     return sentences
 
 
-def _head(result: "FitResult") -> str:
+def _head(result: FitResult) -> str:
     if len(result.parts) > 1:
         return f"together: {', '.join(result.parts)}"
     return (
@@ -374,12 +325,12 @@ def _closeness(part: FittedPart, before: str = "", *, verdict: str = "") -> str:
     return before * bool(said) + ", ".join(said)
 
 
-def _gains(result: "FitResult") -> tuple[str, ...]:
+def _gains(result: FitResult) -> tuple[str, ...]:
     """What the parts of the chosen model gain, where several models were tried."""
-    return gains(result.ladder, describes=result.adequate, datum=_datum(result))
+    return gain_sentences(result.ladder, describes=result.adequate, datum=_datum(result))
 
 
-def _datum(result: "FitResult") -> str:
+def _datum(result: FitResult) -> str:
     """For what chi² of a model that was tried is counted: a bin, or also a point of the dynamic
     stiffness."""
     return "bin" if all(part.stiffness is None for part in result.parts.values()) else "datum"
@@ -410,24 +361,3 @@ def _stiffness(part: FittedPart) -> list[str]:
         f"dynamic stiffness: {len(f)} points from {f[0]:.2g} to {f[-1]:.2g} Hz{faint}, chi2 per"
         f" point {part.chi2_per_point:.2f}"
     ]
-
-
-def as_people_say(product: str) -> str:
-    """A product of parameters by the names of the table above it."""
-    return re.sub(r"\w+", lambda word: in_use(word[0]) or word[0], spelt(product))
-
-
-def in_use(name: str) -> str | None:
-    """The name that people use for a parameter, of one target or "name@target"; None where that is
-    its own."""
-    base, at, target = name.partition("@")
-    return ALIASES[base] + at + target if base in ALIASES else None
-
-
-def once(
-    parameters: Mapping[str, Estimate], derived: Mapping[str, Estimate]
-) -> dict[str, Estimate]:
-    """Parameters and derived quantities; what is both, once, by the name that people use."""
-    return {name: p for name, p in parameters.items() if in_use(name) not in derived} | dict(
-        derived
-    )
