@@ -5,15 +5,15 @@ BIN = .venv/bin
 PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 
-.PHONY: help install fit notebooks test test-fast test-minimum mutants bench docs clean
+.PHONY: help install fit notebooks test test-all test-minimum mutants bench docs clean
 
 help:
 	@echo "make fit        fit a bundled measured target; writes report and figure to out/fit"
 	@echo "make install    only install jaxmuscle into .venv"
 	@echo "make notebooks  open the notebooks in JupyterLab; make notebooks OPEN=no only installs it"
-	@echo "make test       ruff, basedpyright and the whole test suite"
-	@echo "make test WING=spectra  the tests of one folder of the package and of those above it"
-	@echo "make test-fast  the tests that are not marked slow"
+	@echo "make test       for everybody: ruff, types, import contracts and the tests that find nearly everything"
+	@echo "make test WING=spectra  the same tests of one folder of the package and of those above it"
+	@echo "make test-all   for developers, before a release: also pages, notebooks, gallery, kills, damaged files, long studies"
 	@echo "make test-minimum  some tests with the oldest versions that pyproject.toml allows, in .venv-minimum"
 	@echo "make mutants    random faults in the package: which of them a test notices; out/mutants.json"
 	@echo "make bench      measure speed; writes out/bench.json"
@@ -32,16 +32,14 @@ notebooks: .venv/.stamp-notebooks
 	@if [ "$(OPEN)" = yes ]; then $(BIN)/jupyter lab --notebook-dir=notebooks; \
 	 else echo "JupyterLab is installed; open it with: make notebooks"; fi
 
-test: .venv/.stamp-test
+test test-all: .venv/.stamp-test
 	@$(BIN)/python tests/wings.py $(WING) >/dev/null
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/lint-imports
 	@echo "$(BIN)/basedpyright (checks types while the tests begin)"
-	@$(BIN)/basedpyright & types=$$!; $(PYTEST) `$(BIN)/python tests/wings.py $(WING)`; tests=$$?; wait $$types && exit $$tests
-
-test-fast: .venv/.stamp-test
-	$(PYTEST) -m "not slow"
+	@$(BIN)/basedpyright & types=$$!; test $@ = test-all || set -- -m "not slow"; \
+	 $(PYTEST) "$$@" `$(BIN)/python tests/wings.py $(WING)`; tests=$$?; wait $$types && exit $$tests
 
 # What calls most of the libraries, and takes a few minutes.
 MINIMUM = tests/_common tests/spectra/test_spectrum.py tests/data tests/commands tests/model/test_task.py tests/ensembles \

@@ -257,7 +257,8 @@ def files_page() -> str:
         text += f"\n## {title}\n\n{said}\n"
         for table in tables:
             hints = typing.get_type_hints(table, include_extras=True)
-            text += f"\n### {(table.__doc__ or '').strip().rstrip('.')}\n\n"
+            heading = " ".join((table.__doc__ or "").split()).rstrip(".")
+            text += f"\n### {heading}\n\n"
             text += (
                 "| key | meaning | type and range | if missing | since |\n|---|---|---|---|---|\n"
             )
