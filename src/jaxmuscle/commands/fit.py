@@ -35,12 +35,14 @@ from .options import (
     Json,
     MethodName,
     Noise,
+    NoiseName,
     Output,
     Quantity,
     ResidualName,
     Seed,
     Segments,
     TargetTask,
+    TaskName,
     Window,
     fixed_values,
     formats_of,
@@ -242,49 +244,28 @@ def fit(
         from jaxmuscle._common.environment import keep_compiled_programs
 
         keep_compiled_programs()
-        fixed = fixed_values(fix)
-        names = names_in(free)
+        options: dict[str, Any] = {
+            "fix": fixed_values(fix),
+            "free": names_in(free),
+            "noise": None if noise is None else str(noise),
+            "residual": str(residual),
+            "starts": starts,
+            "key": seed,
+        }
         read = {
             "quantity": quantity,
             "segments": segments,
             "dataset": dataset,
             "axis": "linear" if axis is None else axis,
         }
-        recorded = [jm.data.is_recording(name) for name in target]
-        # of several spectra the others are fitted all the same
-        if len(target) == 1 or any(recorded):
-            require_files(target)
-        if any(recorded) and not all(recorded):
-            raise ValueError(
-                f"{target[recorded.index(True)]} is a recording, {target[recorded.index(False)]} a"
-                " spectrum. They cannot be fitted together: fit one at a time, or first make a"
-                " spectrum of each recording with `jaxmuscle analyse ... --save-target FILE.toml`"
-            )
-        if hold and not all(recorded):
-            raise ValueError(NO_MOTION)
-        if rung is not None and (rungs is not None or (len(target) > 1 and not any(recorded))):
-            raise ValueError(
-                "--rung fits one model to one spectrum or to recordings of one condition: leave out"
-                " --rungs (with several spectra --rungs says which model)"
-            )
-        if rung and noise is not None:
-            raise ValueError(
-                "--rung: the models with activation and tremor have noise of their own; leave out"
-                " --noise"
-            )
-        options = {
-            "free": names,
-            "fix": fixed,
-            "noise": None if noise is None else str(noise),
-            "residual": str(residual),
-            "starts": starts,
-            "key": seed,
-        }
-        if len(target) > 1 and not any(recorded):
+        recorded = _are_recordings(target, hold)
+        several = len(target) > 1 and not recorded
+        _check_rung(rung, rungs, noise, several=several)
+        figures = [] if quick else formats_of(formats)
+        if several:
             from .cohort import fit_together
 
             unused(reading, "axis", window=window, what="recordings; these are spectra")
-
             if method != MethodName.linear or seeds is not None or increments is not None or quick:
                 raise ValueError(
                     "several spectra are fitted in one go, without simulation: leave out "
@@ -292,76 +273,135 @@ def fit(
                 )
             options |= {"rung": rungs or 0}
             raise typer.Exit(
-                fit_together(
-                    target, read, task, groups, output, options, formats_of(formats), force=force
-                )
+                fit_together(target, read, task, groups, output, options, figures, force=force)
             )
         if groups is not None:
             raise ValueError(
                 "--groups compares several spectra; to compare recordings of several people use"
                 " `jaxmuscle study`"
             )
-        if any(recorded) and (segments is not None or dataset is not None):
+        if recorded and (segments is not None or dataset is not None):
             raise ValueError(
                 "--segments and --dataset belong to spectra, and these are recordings: leave"
                 " them out"
             )
+        options |= {} if increments is None else {"increments": str(increments)}
         if hold:
-            simulated = {} if increments is None else {"increments": str(increments)}
-            if method != MethodName.linear:
-                raise ValueError(
-                    "with --hold all records are fitted by the formula of the spectrum: leave out"
-                    " --method"
-                )
-            most = 0 if rung is not None or noise is not None or names else RUNGS
-            options |= {"rungs": most if rungs is None else rungs}
-            for name in fixed:
-                if "@" in name:
-                    raise ValueError(
-                        f"--fix {name}: with --hold a fixed value holds for all records. Give --fix"
-                        f" {name.partition('@')[0]}=VALUE"
-                    )
-            if task not in (None, "prescribed-length") or quantity is not None:
-                raise ValueError(
-                    "with --hold the records are those of a moved insertion, and of the force in a"
-                    " hold: leave out --task and --quantity"
-                )
-            options |= simulated | {"starts": starts or 32, "seeds": 0 if quick else seeds or 32}
+            _check_hold(method, options["fix"], task, quantity)
+            most = 0 if rung is not None or noise is not None or options["free"] else RUNGS
+            options |= {
+                "rungs": most if rungs is None else rungs,
+                "starts": starts or 32,
+                "seeds": 0 if quick else seeds or 32,
+            }
             given = read_with_holds(target, hold, reading, window)
             writable(output, "fit.json", force=force, reads=[*target, *hold])
             if rung is not None:
                 bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
                 options["tasks"] = {name: jm.on_rung(base, rung) for name, base in bases.items()}
-            converged = _fit_with_holds(
-                *given, output, options, [] if quick else formats_of(formats)
-            )
-            raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
-        options |= {"method": str(method), "seeds": seeds, "rungs": rungs if rung is None else 0}
-        options |= {"check_seeds": 0} if quick else {}
-        options |= {} if increments is None else {"increments": str(increments)}
-        if any(recorded):
-            found = read_recordings(target, reading, window, task)
-            if isinstance(found, list):
-                aim = found, jm.model.TASKS[task or "prescribed-length"]()
-            else:
-                aim = aimed(found.target(quantity=quantity), task)
-        elif jm.data.is_frequency_response(target[0]):
-            unused(
-                reading,
-                "axis",
-                "lever_arm",
-                window=window,
-                what="recordings; this is a frequency response",
-            )
-            aim = aim_of(target[0], task, {"segments": segments, "lever_arm": reading["lever_arm"]})
+            converged = _fit_with_holds(*given, output, options, figures)
         else:
-            unused(reading, "axis", window=window, what="recordings; this is a spectrum")
-            aim = aim_of(target[0], task, read)
-        writable(output, "fit.json", force=force, reads=target)
-        if rung is not None:
-            aim = aim[0], jm.on_rung(aim[1], rung)
-        converged = _fit_alone(*aim, output, options, [] if quick else formats_of(formats))
+            options |= {
+                "method": str(method),
+                "seeds": seeds,
+                "rungs": rungs if rung is None else 0,
+            }
+            options |= {"check_seeds": 0} if quick else {}
+            seen, model = (
+                _aim_at_recordings(target, reading, window, task, quantity)
+                if recorded
+                else _aim_at_spectrum(target[0], reading, window, task, read)
+            )
+            writable(output, "fit.json", force=force, reads=target)
+            if rung is not None:
+                model = jm.on_rung(model, rung)
+            converged = _fit_alone(seen, model, output, options, figures)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
+
+
+def _are_recordings(targets: list[str], holds: list[str] | None) -> bool:
+    """Whether the targets are recordings, not spectra; a `ValueError` for both at once, or for
+    holds beside spectra."""
+    recorded = [jm.data.is_recording(name) for name in targets]
+    # of several spectra the others are fitted all the same
+    if len(targets) == 1 or any(recorded):
+        require_files(targets)
+    if any(recorded) and not all(recorded):
+        raise ValueError(
+            f"{targets[recorded.index(True)]} is a recording, {targets[recorded.index(False)]} a"
+            " spectrum. They cannot be fitted together: fit one at a time, or first make a"
+            " spectrum of each recording with `jaxmuscle analyse ... --save-target FILE.toml`"
+        )
+    if holds and not all(recorded):
+        raise ValueError(NO_MOTION)
+    return all(recorded)
+
+
+def _check_rung(
+    rung: int | None, rungs: int | None, noise: NoiseName | None, *, several: bool
+) -> None:
+    """Raise a `ValueError` for a --rung beside --rungs, `several` spectra or --noise."""
+    if rung is not None and (rungs is not None or several):
+        raise ValueError(
+            "--rung fits one model to one spectrum or to recordings of one condition: leave out"
+            " --rungs (with several spectra --rungs says which model)"
+        )
+    if rung and noise is not None:
+        raise ValueError(
+            "--rung: the models with activation and tremor have noise of their own; leave out"
+            " --noise"
+        )
+
+
+def _check_hold(
+    method: MethodName, fixed: dict[str, float], task: str | None, quantity: str | None
+) -> None:
+    """Raise a `ValueError` for an option that does not go with --hold."""
+    if method != MethodName.linear:
+        raise ValueError(
+            "with --hold all records are fitted by the formula of the spectrum: leave out --method"
+        )
+    for name in fixed:
+        if "@" in name:
+            raise ValueError(
+                f"--fix {name}: with --hold a fixed value holds for all records. Give --fix"
+                f" {name.partition('@')[0]}=VALUE"
+            )
+    if task not in (None, "prescribed-length") or quantity is not None:
+        raise ValueError(
+            "with --hold the records are those of a moved insertion, and of the force in a"
+            " hold: leave out --task and --quantity"
+        )
+
+
+def _aim_at_recordings(
+    paths: list[str],
+    reading: dict[str, Any],
+    window: str | None,
+    task: TaskName | None,
+    quantity: str | None,
+) -> tuple[Any, Any]:
+    """Perturbed recordings, or the target that others give, and the task to fit to it."""
+    found = read_recordings(paths, reading, window, task)
+    if isinstance(found, list):
+        return found, jm.model.TASKS[task or "prescribed-length"]()
+    return aimed(found.target(quantity=quantity), task)
+
+
+def _aim_at_spectrum(
+    name: str,
+    reading: dict[str, Any],
+    window: str | None,
+    task: TaskName | None,
+    read: dict[str, Any],
+) -> tuple[Any, Any]:
+    """The target of a spectrum or a frequency response, and the task to fit to it."""
+    if not jm.data.is_frequency_response(name):
+        unused(reading, "axis", window=window, what="recordings; this is a spectrum")
+        return aim_of(name, task, read)
+    what = "recordings; this is a frequency response"
+    unused(reading, "axis", "lever_arm", window=window, what=what)
+    return aim_of(name, task, {"segments": read["segments"], "lever_arm": reading["lever_arm"]})
 
 
 def _fit_alone(
