@@ -189,24 +189,8 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
             require_task(each, "ensemble(task, key, seeds=...)")
     if not isinstance(task, AbstractTask | Sweep):
         task = Sweep.of(task)
-    if store is not None and not isinstance(store, str | Path):
-        raise ValueError(f"store = {store!r}: give a path or a URL")
-    if control is not None and not isinstance(control, bool):
-        raise ValueError(f"control = {control!r}: give True, False, or None to let it be decided")
     key, numbers = key_of(key), seeds_of(seeds)
-    if chunk is not None:
-        count("chunk", chunk, 1)
-    if threads is not None:
-        count("threads", threads, 1, 1024)
-    if resume and overwrite:
-        raise ValueError(
-            "resume (--resume) continues a store, overwrite (--force) replaces it: give one of"
-            " the two"
-        )
-    if (resume or states) and store is None:
-        raise ValueError(
-            f"{'resume' if resume else 'states'} = True belongs to a store: give store="
-        )
+    _check_options(store, resume, overwrite, states, control, chunk, threads)
     levels, draws = _levels(reduce), Draws.of(generator, increments)
     if draws.increments == "weak":
         _check_weak(levels)
@@ -285,6 +269,35 @@ def runs_for_means(task: AbstractTask, key: Key, seeds: int, draws: Draws) -> Tr
     found = _in_memory(layout, lambda pace: None)
     assert isinstance(found, Trajectory)
     return found
+
+
+def _check_options(
+    store: str | Path | None,
+    resume: bool,
+    overwrite: bool,
+    states: bool,
+    control: bool | None,
+    chunk: int | None,
+    threads: int | None,
+) -> None:
+    """Raise a `ValueError` for options that are wrong, alone or together."""
+    if store is not None and not isinstance(store, str | Path):
+        raise ValueError(f"store = {store!r}: give a path or a URL")
+    if control is not None and not isinstance(control, bool):
+        raise ValueError(f"control = {control!r}: give True, False, or None to let it be decided")
+    if chunk is not None:
+        count("chunk", chunk, 1)
+    if threads is not None:
+        count("threads", threads, 1, 1024)
+    if resume and overwrite:
+        raise ValueError(
+            "resume (--resume) continues a store, overwrite (--force) replaces it: give one of"
+            " the two"
+        )
+    if (resume or states) and store is None:
+        raise ValueError(
+            f"{'resume' if resume else 'states'} = True belongs to a store: give store="
+        )
 
 
 def _levels(reduce: bool | tuple[float, ...]) -> tuple[float, ...] | None:
