@@ -376,17 +376,7 @@ def _summary(layout: Layout, levels: tuple[float, ...], found: Reduced) -> Ensem
         expected = np.stack([np.asarray(spectrum.power, float) for spectrum in spectra])
     failed: Int[np.ndarray, "failed 2"] = np.array(sorted(found.failed), int).reshape(-1, 2)
     described = about(layout) | ({} if layout.whole else {"cells_per_quantile": CELLS})
-    return summarised(
-        found.tally,
-        layout.task,
-        len(layout.seeds),
-        layout.time,
-        levels,
-        layout.recipe.settings,
-        expected,
-        failed,
-        described,
-    )
+    return summarised(layout, found.tally, levels, expected, failed, described)
 
 
 def _loaded(place: AbstractPlace, blank: EnsembleSummary) -> EnsembleSummary:

@@ -14,8 +14,8 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.text import folded, listed, squared
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._mean import SpectrumEstimate
-from jaxmuscle.spectra._settings import SpectrumSettings
 
+from ._layout import Layout
 from ._running_moments import RunningMoments, quantiles
 from ._sweep import Sweep
 
@@ -245,19 +245,17 @@ def computed(
 
 
 def summarised(
+    layout: Layout,
     tally: RunningMoments,
-    task: AbstractTask | Sweep,
-    seeds: int,
-    time: Float[np.ndarray, " samples"],
     levels: tuple[float, ...],
-    settings: SpectrumSettings,
     expected: Float[np.ndarray, "points bins"] | None,
     failed: Int[np.ndarray, "failed 2"],
     about: dict[str, Any],
 ) -> EnsembleSummary:
     """A tally in words; `expected`, the exact linear spectra or None."""
     arrays = computed(tally, levels, expected)
-    unit, points = (task[0] if isinstance(task, Sweep) else task).output_unit, len(tally.seeds)
+    task, settings, points = layout.task, layout.recipe.settings, len(tally.seeds)
+    unit = layout.task_of(0).output_unit
     variation, spectra = np.full((points, 2), np.nan), []
     if "power" in arrays:
         variation = np.stack(
@@ -279,8 +277,8 @@ def summarised(
     )
     return EnsembleSummary(
         task,
-        seeds,
-        time,
+        len(layout.seeds),
+        layout.time,
         mean,
         variance,
         levels,
