@@ -1,6 +1,7 @@
 """The table of a study: which file is which trial of whom, in which group and condition, and how
 files are read."""
 
+import math
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -337,17 +338,22 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
             raise ValueError(f"{place}: has {len(cells)} cells, the header {len(names)} columns")
         row: dict[str, Any] = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
         for name in set(NUMBERS) & set(row):
-            try:
-                row[name] = (
-                    int(row[name]) if name == "skip_rows" else number_in(row[name], delimiter)
-                )
-                if not is_real(row[name]):
-                    raise ValueError(f"{row[name]} is not finite")
-            except ValueError:
-                kind = "whole number" if name == "skip_rows" else "number"
-                raise ValueError(f"{place}: {name} = {row[name]!r} is not a {kind}") from None
+            row[name] = _number(name, row[name], delimiter, place)
         found.append((place, row))
     return found
+
+
+def _number(name: str, cell: str, delimiter: str, place: str) -> int | float:
+    """The number in a cell of the column `name`."""
+    whole = name == "skip_rows"
+    try:
+        number = int(cell) if whole else number_in(cell, delimiter)
+    except ValueError:
+        number = math.nan
+    if not is_real(number):
+        kind = "whole number" if whole else "number"
+        raise ValueError(f"{place}: {name} = {cell!r} is not a {kind}")
+    return number
 
 
 def _checked(
