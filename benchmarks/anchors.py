@@ -18,9 +18,10 @@ ANCHOR = "C with SIMD"
 
 
 @numba.njit(fastmath=True)
-def _by_numba(rng, p, scale, P_w, F_ext, harmonic_w, harmonic_z, seeds, steps, dt, out):
+def _by_numba(rng, p, scale, inputs, steps, dt, out):
     m_w, m_z, k_w, k_z, c_w, c_z, xw2, xz2, vw2, vz2 = p
-    for seed in range(seeds):
+    P_w, F_ext, harmonic_w, harmonic_z = inputs
+    for seed in range(out.size):
         y, moved, first = np.zeros(4, np.float32), np.zeros(4, np.float32), np.zeros(4, np.float32)
         for k in range(steps):
             n0, n1 = scale[0] * rng.standard_normal(), scale[1] * rng.standard_normal()
@@ -48,7 +49,7 @@ def _by_numba(rng, p, scale, P_w, F_ext, harmonic_w, harmonic_z, seeds, steps, d
 def anchors(task: Any) -> dict[str, Any]:
     """The last x_z of every seed by C, if there is a compiler, and, with white noise, by numba with
     PCG64."""
-    inputs = [np.ascontiguousarray(row, np.float32) for row in grid_inputs(task)]
+    inputs = tuple(np.ascontiguousarray(row, np.float32) for row in grid_inputs(task))
     p, found, compiler = tuple(np.float32(v) for v in numbers(task)), {}, shutil.which("gcc")
     white = isinstance(task.noise, jm.WhiteNoise)
     f, root, deviation = filter_matrices(*BAND, DT)
@@ -57,8 +58,8 @@ def anchors(task: Any) -> dict[str, Any]:
 
     def by_numba():
         out = np.empty(SEEDS, np.float32)
-        rng, (P_w, F_ext, wave_w, wave_z) = np.random.Generator(np.random.PCG64(1)), inputs
-        _by_numba(rng, p, scale, P_w, F_ext, wave_w, wave_z, SEEDS, STEPS, np.float32(DT), out)
+        rng = np.random.Generator(np.random.PCG64(1))
+        _by_numba(rng, p, scale, inputs, STEPS, np.float32(DT), out)
         return out
 
     if white:
