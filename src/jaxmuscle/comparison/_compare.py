@@ -36,7 +36,7 @@ from ._evidence import Candidate, Folds, held_out, masked_bins, maxima, without_
 Value = TypeVar("Value")
 
 
-def compare_noise(
+def compare_noise(  # noqa: PLR0913 (options of a public call)
     task: AbstractTask,
     target: Target,
     *,

@@ -119,7 +119,7 @@ class FrequencyResponse(Printed, eqx.Module):
         self.name, self.source, self.notices = name, source, tuple(notices)
 
     @classmethod
-    def from_gain(
+    def from_gain(  # noqa: PLR0913 (options of a public call)
         cls,
         frequency: Any,
         gain: Any,

@@ -142,7 +142,7 @@ class PerturbedRecording(Printed, eqx.Module):
         self.notices = tuple(dict.fromkeys((*notices, *force.notices, *moved)))
 
     @classmethod
-    def from_array(
+    def from_array(  # noqa: PLR0913 (options of a public call)
         cls,
         force: Any,
         displacement: Any,

@@ -91,7 +91,7 @@ class Recording(Shown, eqx.Module):
         self.window = None if window is None else self._checked(window)
 
     @classmethod
-    def from_dataframe(
+    def from_dataframe(  # noqa: PLR0913 (options of a public call)
         cls,
         frame: Any,
         *,
@@ -117,7 +117,7 @@ class Recording(Shown, eqx.Module):
         return recording_of(cls, frame_table(frame), reading, name)
 
     @classmethod
-    def from_array(
+    def from_array(  # noqa: PLR0913 (options of a public call)
         cls,
         samples: Any,
         rate: float | int,

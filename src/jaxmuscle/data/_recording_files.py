@@ -29,7 +29,7 @@ def load_recording(
 def load_recording(
     path: str | os.PathLike[str] | Table, *, force: str | int, **options: Any
 ) -> PerturbedRecording: ...
-def load_recording(  # pyright: ignore[reportInconsistentOverload]
+def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsistentOverload]
     path: str | os.PathLike[str] | Table,
     *,
     column: str | int | None = None,

@@ -86,7 +86,7 @@ class Target(Shown, eqx.Module):
     settings: SpectrumSettings = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (options of a public call)
         self,
         name: str,
         proportional_power: Any,

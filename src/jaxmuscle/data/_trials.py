@@ -144,7 +144,7 @@ class Trials(Shown, Sequence[Recording]):
         return Card(folded([head, *lines]), head, ("recording", "window", "mean"), rows)
 
 
-def load_recordings(
+def load_recordings(  # noqa: PLR0913 (options of a public call)
     paths: "Iterable[str | os.PathLike[str] | Table] | str | os.PathLike[str] | Table",
     *,
     columns: Iterable[str | int] | None = None,

@@ -112,7 +112,7 @@ def ensemble(
 ) -> "xarray.Dataset": ...
 
 
-def ensemble(  # pyright: ignore[reportInconsistentOverload]
+def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsistentOverload]
     task: AbstractTask | Sweep | Sequence[AbstractTask],
     key: Key,
     *,

@@ -152,7 +152,7 @@ class Layout(NamedTuple):
         return self.task[point] if isinstance(self.task, Sweep) else self.task
 
 
-def laid_out(
+def laid_out(  # noqa: PLR0913 (each is a field of the layout or its recipe)
     task: AbstractTask | Sweep,
     key: PRNGKeyArray,
     seeds: Int[np.ndarray, " seeds"] | range,

@@ -219,7 +219,7 @@ def _determined(result: FitResult) -> dict[str, Any]:
     return result.as_shown(result.determined)
 
 
-def fit_cohort(
+def fit_cohort(  # noqa: PLR0913 (options of a public call)
     targets: Iterable[Any],
     *,
     groups: Mapping[str, str] | None = None,

@@ -23,7 +23,7 @@ from ._result import FitResult
 from ._search import search
 
 
-def fit(
+def fit(  # noqa: PLR0913 (options of a public call)
     task: AbstractTask,
     target: Any,
     *,

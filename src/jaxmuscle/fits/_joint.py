@@ -40,7 +40,7 @@ Tasks = dict[str, AbstractTask]
 FAR = 0.1  # of a stated mean force
 
 
-def fit_joint(
+def fit_joint(  # noqa: PLR0913 (options of a public call)
     targets: Mapping[str, Any],
     *,
     tasks: Mapping[str, AbstractTask] | None = None,

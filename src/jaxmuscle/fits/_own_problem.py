@@ -204,7 +204,7 @@ class Problem(Shown):
         return Card(text, heading, ("name", "start", "unit"), rows)
 
 
-def problem(
+def problem(  # noqa: PLR0913 (options of a public call)
     task: AbstractTask,
     target: Any,
     *,

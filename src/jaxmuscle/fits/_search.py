@@ -62,7 +62,7 @@ class FitInterrupted(KeyboardInterrupt):
             return self.report()
 
 
-def search(
+def search(  # noqa: C901, PLR0915 (will soon be rewritten)
     plan: Plan, answer: Callable[[FitResult], None] | None = None, models: Models | None = None
 ) -> FitResult:
     """From the starting points to a result; Ctrl-C ends it with what had been reached.

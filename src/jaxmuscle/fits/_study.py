@@ -301,7 +301,7 @@ def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
     }
 
 
-def run_study(
+def run_study(  # noqa: PLR0913 (options of a public call)
     study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]",
     *,
     rung: int | str | None = None,

@@ -39,7 +39,7 @@ _TREMOR = "physiological tremor of hand and wrist, 8 to 12 Hz (Elble & Koller 19
 _SLOW = "a slower oscillation of wrist force seen near 3 to 4 Hz"
 
 
-def _row(
+def _row(  # noqa: PLR0913 (the columns of the table)
     name,
     symbol,
     unit,

@@ -126,7 +126,7 @@ class PrescribedForce(AbstractTask):
     state_names: ClassVar[tuple[str, ...]] = ("x_w", "v_w", "x_z", "v_z")
     state_units: ClassVar[tuple[str, ...]] = ("m", "m/s", "m", "m/s")
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (options of a public call)
         self,
         P_w: "AbstractSignal | Scalar" = PARAMETERS["P_w"].default,
         F_ext: "AbstractSignal | Scalar" = PARAMETERS["F_ext"].default,

@@ -111,7 +111,7 @@ class MonteCarlo(eqx.Module):
     points: Float[Array | np.ndarray, " points"] | None = None
 
     @classmethod
-    def of(
+    def of(  # noqa: PLR0913 (all that its paths and bins depend on)
         cls,
         settings: SpectrumSettings,
         key: PRNGKeyArray,

@@ -46,7 +46,7 @@ LEAST_SECONDS = 8.0  # of a record, as a fit asks for
 NOTHING = 1e-4  # of the relative variance, by which a motion must lower it
 
 
-def design_input(
+def design_input(  # noqa: PLR0913 (options of a public call)
     result: FitResult | AbstractTask,
     quantity: str | Iterable[str] = "K_w0",
     *,

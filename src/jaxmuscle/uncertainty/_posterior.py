@@ -36,7 +36,7 @@ ROWS = 256
 DRAWS = 600, 800, 1100, 1600, 2300, 3000
 
 
-def posterior(
+def posterior(  # noqa: PLR0913 (options of a public call)
     result: FitResult,
     target: Target | None = None,
     *,
