@@ -6,9 +6,9 @@ test finds.
 
 A mutant is a copy of the package with one operator, comparison, number or condition changed. It
 runs the test files of its subject in the order of `SUBJECTS`, the most direct first, and of these
-first what is not slow. It ends at the first failure or after `--seconds`. Other files might find
-it, too: the share that is killed is a lower bound. Mutants that were run stay in the file and are
-not run again.
+first what `make test` runs, then what `make test-all` adds. It ends at the first failure or after
+`--seconds`. Other files might find it, too: the share that is killed is a lower bound. Mutants that
+were run stay in the file and are not run again.
 """
 
 import argparse
@@ -187,6 +187,7 @@ WORDS_AND_PICTURES = {"__str__", "__repr__", "plot", "message", "remarks", "noti
 
 
 NO_TESTS = 5  # pytest's exit code where none has the mark
+COMMANDS = {"make test": "not slow", "make test-all": "slow"}  # which tests each runs first
 
 
 class Mutant(NamedTuple):
@@ -307,9 +308,9 @@ def judged(mutant: Mutant, folder: Path, seconds: float) -> dict[str, Any]:
         for test in SUBJECTS[mutant.subject][1]
         for file in sorted((folder / "tests").rglob(f"test_{test}.py"))
     ]
-    begun, killer, ended = time.monotonic(), None, True
+    begun, killer, noticed_by, ended = time.monotonic(), None, None, True
     try:
-        for mark in ("not slow", "slow"):
+        for name, mark in COMMANDS.items():
             command = [
                 sys.executable,
                 "-m",
@@ -335,12 +336,18 @@ def judged(mutant: Mutant, folder: Path, seconds: float) -> dict[str, Any]:
             failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
             if done.returncode not in (0, NO_TESTS):
                 killer = failed.group(1) if failed else f"exit {done.returncode}"
+                noticed_by = name
                 break
     except subprocess.TimeoutExpired:
         ended = False
     finally:
         path.write_text(original, encoding="utf-8")
-    return {"killed by": killer, "all run": ended, "seconds": round(time.monotonic() - begun, 1)}
+    return {
+        "killed by": killer,
+        "command": noticed_by,
+        "all run": ended,
+        "seconds": round(time.monotonic() - begun, 1),
+    }
 
 
 def copied(folder: Path, tests: Path) -> Path:
@@ -357,22 +364,22 @@ def copied(folder: Path, tests: Path) -> Path:
 
 
 def table(found: dict[str, Any]) -> str:
-    """Mutants and killed ones of every subject, then the survivors."""
-    count, killed = collections.Counter(), collections.Counter()
+    """Mutants of every subject, how many each command notices, then the survivors."""
+    count = collections.Counter(row["subject"] for row in found.values())
+    killed = {name: collections.Counter[str]() for name in COMMANDS}
     for row in found.values():
-        count[row["subject"]] += 1
-        killed[row["subject"]] += row["killed by"] is not None
-    rows = [f"{subject:18}{count[subject]:5}{killed[subject]:5}" for subject in count]
-    total = (
-        f"{'all':18}{count.total():5}{killed.total():5}  "
-        f" {100 * killed.total() / max(count.total(), 1):.0f} %"
-    )
+        killed["make test"][row["subject"]] += row["command"] == "make test"
+        killed["make test-all"][row["subject"]] += row["killed by"] is not None
+    numbers = {name: [count[name], *(of[name] for of in killed.values())] for name in count}
+    numbers["all"] = [count.total(), *(of.total() for of in killed.values())]
+    rows = [f"{name:18}" + "".join(f"{n:14}" for n in row) for name, row in numbers.items()]
     alive = [
         f"  survives: {row['subject']}: {name}"
         for name, row in found.items()
         if row["killed by"] is None
     ]
-    return "\n".join([f"{'subject':18}{'mutants':>5}{'killed':>7}", *rows, total, *alive])
+    heading = f"{'subject':18}" + "".join(f"{name:>14}" for name in ("mutants", *COMMANDS))
+    return "\n".join([heading, *rows, *alive])
 
 
 def main() -> None:
