@@ -90,15 +90,27 @@ ramp = np.linspace(0.0, float(held[0]), 3000)
 np.savetxt("trial.csv", np.concatenate([ramp, held, ramp[::-1]]), header="force", comments="")
 recording = jm.load_recording("trial.csv", column="force", rate=1000, units="N")
 seeds = jm.ensemble(jm.settled(result.task), key, seeds=5, duration=20.0)
-trials = [jm.Recording(force, seeds.rate, name=f"trial {i}") for i, force in enumerate(np.asarray(seeds.output))]
+trials = [
+    jm.Recording(force, seeds.rate, name=f"trial {i}")
+    for i, force in enumerate(np.asarray(seeds.output))
+]
 
 people = {}
 for i, name in enumerate(["ann", "ben", "eve", "jim", "kim", "tom"]):
-    one = jm.at_level(jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.2 + 0.1 * i, reference=0.26)
-    power = np.asarray(jm.ensemble(one, jax.random.key(i), seeds=6).spectrum().mean().proportional, float)
+    one = jm.at_level(
+        jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.2 + 0.1 * i, reference=0.26
+    )
+    power = np.asarray(
+        jm.ensemble(one, jax.random.key(i), seeds=6).spectrum().mean().proportional, float
+    )
     people[name] = jm.Target(name, power, segments=[6] * 6, mvc_fraction=0.2 + 0.1 * i)
-cohort = jm.fit_cohort(list(people.values()), groups={name: "ab"[i % 2] for i, name in enumerate(people)})
-pair = {name: jm.Isometric().replace(P_w=5.0 * people[name].mvc_fraction / 0.26) for name in ("ann", "eve")}
+cohort = jm.fit_cohort(
+    list(people.values()), groups={name: "ab"[i % 2] for i, name in enumerate(people)}
+)
+pair = {
+    name: jm.Isometric().replace(P_w=5.0 * people[name].mvc_fraction / 0.26)
+    for name in ("ann", "eve")
+}
 """
 MOVED = """
 import numpy as np
@@ -109,23 +121,35 @@ low = scipy.signal.butter(4, 5.0, fs=1000.0, output="sos")
 moved = scipy.signal.sosfilt(low, np.random.default_rng(0).standard_normal(held.size))
 moved *= 1e-3 / np.std(moved)
 speed = np.gradient(moved, 1e-3)
-force = held + 300.0 * moved + 6.0 * speed + 0.1 * np.gradient(speed, 1e-3)  # a spring, damper, mass beside it
+# a spring, damper, mass beside it
+force = held + 300.0 * moved + 6.0 * speed + 0.1 * np.gradient(speed, 1e-3)
 perturbed = jm.PerturbedRecording.from_array(force, moved, 1000, name="anna", window=(2.0, 60.0))
 
-time, lines = np.arange(7200) / 100, np.arange(8, 361) / 72  # a muscle, moved by sines from 0.1 to 5 Hz, 1 mm rms
+# a muscle, moved by sines from 0.1 to 5 Hz, 1 mm rms
+time, lines = np.arange(7200) / 100, np.arange(8, 361) / 72
 phases = np.random.default_rng(1).uniform(0, 2 * np.pi, lines.size)
-length = 1e-3 * np.sqrt(2 / lines.size) * np.cos(2 * np.pi * np.outer(time, lines) + phases).sum(axis=1)
-muscle = jm.PrescribedLength(x_z=jm.model.Sampled.through(time, -length)).replace(harmonic_amplitude=0.0)
+length = (
+    1e-3 * np.sqrt(2 / lines.size) * np.cos(2 * np.pi * np.outer(time, lines) + phases).sum(axis=1)
+)
+muscle = jm.PrescribedLength(x_z=jm.model.Sampled.through(time, -length)).replace(
+    harmonic_amplitude=0.0
+)
 pulled = np.asarray(jm.simulate(muscle, key, duration=71.9, rate=100.0).output)
-minute = jm.PerturbedRecording.from_array(pulled, length[: pulled.size], 100, name="a minute", window=(6.0, 66.0))
+minute = jm.PerturbedRecording.from_array(
+    pulled, length[: pulled.size], 100, name="a minute", window=(6.0, 66.0)
+)
 """
 STUDY = """
 rows = []
 for i, name in enumerate(people):
     one = jm.at_level(jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.3, reference=0.26)
-    for j, force in enumerate(np.asarray(jm.ensemble(jm.settled(one), jax.random.key(i), seeds=3, duration=25.0).output)):
+    for j, force in enumerate(
+        np.asarray(jm.ensemble(jm.settled(one), jax.random.key(i), seeds=3, duration=25.0).output)
+    ):
         np.save(f"{name}-{j}.npy", force)
-        rows.append({"file": f"{name}-{j}.npy", "person": name, "group": "ab"[i % 2], "trial": str(j)})
+        rows.append(
+            {"file": f"{name}-{j}.npy", "person": name, "group": "ab"[i % 2], "trial": str(j)}
+        )
 study = jm.run_study(rows, rate=100.0, units="N m", window=(5.0, 25.0), rung=0)
 """
 SECTIONS = (

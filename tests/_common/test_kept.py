@@ -228,7 +228,6 @@ print(program.traces, *(np.asarray(x).tobytes().hex() for x in found), sep="-")
 """
 
 
-@pytest.mark.slow
 def test_between_processes(tmp_path):
     """Two at once, then one more, which traces nothing. Without a cache there are no files."""
     users: Any = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "jax"), "XLA_FLAGS": ""}
@@ -254,7 +253,6 @@ print(_expected._compiled_response.traces, power.tobytes().hex(), len(heavy))
 """
 
 
-@pytest.mark.slow
 def test_another_process_loads_what_this_one_made(x64):
     """It traces nothing, and imports nothing that only tracing and drawing need."""
     power = np.asarray(jm.expected_spectrum(jm.Isometric()).power)

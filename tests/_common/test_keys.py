@@ -95,7 +95,6 @@ def public_calls(key):
     }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("call", public_calls(0))
 @pytest.mark.parametrize("kind", ["negative", "fraction", "list"])
 def test_a_wrong_key_is_an_error_of_every_function(kind, call):
@@ -134,7 +133,6 @@ def test_seeds_that_are_right(given):
     np.testing.assert_array_equal(list(seeds_of(given)), [0, 1, 2])
 
 
-@pytest.mark.slow
 def test_the_last_seed_is_one_of_its_own():
     np.testing.assert_array_equal(seeds_of([LAST, 0]), [LAST, 0])
     task = jm.Isometric(P_w=jm.model.Constant(5.0))

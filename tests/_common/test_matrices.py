@@ -10,7 +10,6 @@ from compiled import at_once
 from jaxmuscle._common.matrices import exponential, product
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-8, 1e-3, 0.3, 10.0, 1e3, 1e5])
 @pytest.mark.parametrize("states", [1, 2, 5])
 def test_exponential(x64, size, states):

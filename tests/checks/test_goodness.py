@@ -120,7 +120,6 @@ def test_p_values_count_ties_as_extreme_and_few_runs_as_extreme():
     )
 
 
-@pytest.mark.slow
 def test_reference_runs_are_those_of_correlated_bins(x64):
     """Orthant probability: neighbours of correlation c differ in sign with probability arccos(c)/π
     (many segments)."""
@@ -187,7 +186,6 @@ def linear_chi2(result):
     return np.trace(left @ (sd[:, None] * law.correlation * sd) @ left.T) / (n - 1)
 
 
-@pytest.mark.slow
 def test_line_that_the_model_cannot_have_is_found():
     power = expected().copy()
     power[15] *= 6.0
@@ -196,7 +194,6 @@ def test_line_that_the_model_cannot_have_is_found():
     assert "one bin stands out" in found.sentences[2] and "6.25 Hz" in found.sentences[2]
 
 
-@pytest.mark.slow
 def test_smooth_misfit_is_found_by_the_runs():
     wave = np.exp(0.35 * np.sin(2 * np.pi * 1.5 * np.arange(30) / 30))
     found = jm.goodness(fits([expected() * wave])[0], replicates=199)
@@ -205,7 +202,6 @@ def test_smooth_misfit_is_found_by_the_runs():
     assert "the fit is too high or too low over whole ranges of frequency" in found.sentences[1]
 
 
-@pytest.mark.slow
 def test_refits_reach_the_minima_of_a_full_search(x64):
     """Four starts for each replicate against the 32 of a fit, with a harmonic that may go
     anywhere."""
@@ -228,7 +224,6 @@ def test_refits_reach_the_minima_of_a_full_search(x64):
     assert abs(mine.mean() - theirs.mean()) < 0.03
 
 
-@pytest.mark.slow
 def test_another_target_is_foretold_not_fitted():
     first, second = drawn_fits()[:2]
     own, other = (
@@ -251,7 +246,6 @@ def test_another_target_is_foretold_not_fitted():
     )
 
 
-@pytest.mark.slow
 def test_key_decides_and_figures_are_drawn():
     result = drawn_fits()[2]
     a, b, c = (jm.goodness(result, replicates=49, key=k) for k in (1, 1, 2))
@@ -270,7 +264,6 @@ def test_key_decides_and_figures_are_drawn():
     plt.close(figure)
 
 
-@pytest.mark.slow
 def test_goodness_refuses():
     result = perfect()
     with pytest.raises(ValueError, match="at least 19"):
@@ -296,7 +289,6 @@ def test_verdicts_of_known_refits():
     assert of(1.0, shift=0.3).bias == pytest.approx(0.3)
 
 
-@pytest.mark.slow
 def test_bootstrap_refuses():
     with pytest.raises(ValueError, match="at least 2"):
         jm.bootstrap(perfect(), replicates=1)
@@ -331,7 +323,6 @@ def test_stated_errors_hold_for_a_well_determined_fit():
         assert abs(q.bias) < 4 * q.bias_stderr + 0.15 * q.stated
 
 
-@pytest.mark.slow
 def test_bootstrap_is_told_saved_and_drawn(tmp_path):
     found = bootstrapped()
     assert max(map(len, str(found).splitlines())) <= 80
@@ -349,7 +340,6 @@ def test_bootstrap_is_told_saved_and_drawn(tmp_path):
     plt.close(figure)
 
 
-@pytest.mark.slow
 def test_bootstrap_of_a_sigma_draws_from_the_gaussian_law():
     result = fits([expected()], segments=None, sigma=0.2 * expected())[0]
     with without_intervals():

@@ -267,7 +267,6 @@ def test_the_nearest_preset_is_named(tmp_path):
         assert result.exit_code == 2 and f"did you mean '{name}'" in result.stderr
 
 
-@pytest.mark.slow
 def test_a_preset_with_a_mean_force_is_simulated_at_it(tmp_path):
     """The same random numbers: the force of every instant is multiplied by the ratio of the
     means."""
@@ -297,7 +296,6 @@ def test_a_preset_with_a_mean_force_is_simulated_at_it(tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_what_is_observed_of_a_motion(tmp_path):
     arguments = [
         "simulate",
@@ -322,7 +320,6 @@ def test_what_is_observed_of_a_motion(tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_a_moved_insertion_is_simulated(tmp_path):
     """The force of every instant long before and after a step is that of the muscle at rest at that
     length."""
@@ -361,7 +358,6 @@ def test_a_moved_insertion_is_simulated(tmp_path):
 # --- listings
 
 
-@pytest.mark.slow
 def test_listings_and_help_do_not_wait_for_jax():
     code = """
 import sys
@@ -441,7 +437,6 @@ def fitted(tmp_path_factory):
     return result, folder / "out"
 
 
-@pytest.mark.slow
 def test_a_fit_writes_result_table_and_figure(fitted):
     outcome, folder = fitted
     assert outcome.exit_code == 0
@@ -464,7 +459,6 @@ def test_a_fit_writes_result_table_and_figure(fitted):
     assert (folder / "fit.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
 def test_a_fit_prints_what_it_found(fitted):
     outcome, folder = fitted
     for part in (
@@ -481,7 +475,6 @@ def test_a_fit_prints_what_it_found(fitted):
     assert "m_w" not in outcome.stdout
 
 
-@pytest.mark.slow
 def test_what_was_fitted_can_be_explored(fitted, tmp_path):
     _, folder = fitted
     assert (
@@ -499,7 +492,6 @@ def test_what_was_fitted_can_be_explored(fitted, tmp_path):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*K_w is negative")  # so it is in this made-up spectrum
 def test_what_to_measure_next_is_told_of_a_fit(fitted, tmp_path):
     _, folder = fitted
@@ -595,7 +587,6 @@ def test_commands_set_of_the_environment_what_the_user_has_not(
     assert seen == [expected]
 
 
-@pytest.mark.slow
 def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
     import xarray
 
@@ -631,7 +622,6 @@ def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
     np.testing.assert_allclose(found["spectrum"]["power"], columns["power"], rtol=1e-7)
 
 
-@pytest.mark.slow
 def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
     seen = []
 
@@ -659,7 +649,6 @@ def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
     assert not jm.load_result(tmp_path / "out" / "b" / "fit.json").success
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("result", "code", "word"),
     [
@@ -681,7 +670,6 @@ def test_the_exit_code_says_whether_it_converged(result, code, word, tmp_path, m
     assert len(read_columns(tmp_path / "spectrum.csv")["fitted"]) == 30
 
 
-@pytest.mark.slow
 def test_options_reach_the_fit(tmp_path, monkeypatch):
     seen = {}
 
@@ -789,7 +777,6 @@ def strict(text):
     return json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", ENDS)
 def test_exit_codes_and_json(case, tmp_path, monkeypatch):
     fake, code, there = ENDS[case]
@@ -831,7 +818,6 @@ def test_listings_as_json():
 GROUPS = {"a": "old", "b": "young"}
 
 
-@pytest.mark.slow
 def test_a_cohort_as_json(tmp_path, monkeypatch):
     results = {"a": made_result(), "b": failed_result()}
     monkeypatch.setattr(
@@ -863,7 +849,6 @@ def test_a_cohort_as_json(tmp_path, monkeypatch):
     assert (tmp_path / "out" / "differences.csv").exists()
 
 
-@pytest.mark.slow
 def test_a_cohort_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
     """One without groups has no differences; what others wrote there stays."""
     for name in ("differences.csv", "mine.csv"):
@@ -924,7 +909,6 @@ OVERWRITES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "file"), [(case, file) for case, (*_, files) in OVERWRITES.items() for file in files]
 )
@@ -989,7 +973,6 @@ def test_the_spectrum_of_another_command_is_kept(tmp_path, capsys):
     assert capsys.readouterr().err == "" and len(list(tmp_path.glob("spectrum*.csv"))) == 3
 
 
-@pytest.mark.slow
 def test_analyse_and_simulate_keep_the_spectrum_of_another_command(tmp_path):
     tremor = tmp_path / "trial.csv"
     time = np.arange(0, 20, 0.01)
@@ -1066,7 +1049,6 @@ def made_comparison(target, *, success):
     return jm.comparison.Comparison(target, tuple(rows), {}, tasks, fitted, 12.0, 3, 0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("success", [True, False])
 def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
     """`compare` takes a fit.json and says which search did not converge, in words and in the
@@ -1103,7 +1085,6 @@ def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
     )
 
 
-@pytest.mark.slow
 def test_a_fit_is_replaced(tmp_path, monkeypatch):
     for seed, force in ((1, ()), (2, ("--force",))):
         monkeypatch.setattr(jm, "fit", lambda *_, seed=seed, **__: made_result(seed=seed))
@@ -1157,7 +1138,6 @@ def test_an_interruption_before_the_first_step_writes_nothing(tmp_path, monkeypa
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
 def test_ctrl_c(tmp_path):
     """A real signal, once the first steps have been taken."""
     code = """
@@ -1203,7 +1183,6 @@ main()
 # --- compilation cache
 
 
-@pytest.mark.slow
 def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file" / "cache"))
@@ -1228,7 +1207,6 @@ def test_the_cache_is_the_users_without_environment(tmp_path, monkeypatch):
     assert keep_compiled_programs() == tmp_path / "jaxmuscle" / "jax"
 
 
-@pytest.mark.slow
 def test_the_console_script_is_the_command():
     script = Path(sys.executable).with_name("jaxmuscle")
     done = subprocess.run(
@@ -1240,7 +1218,6 @@ def test_the_console_script_is_the_command():
 
 
 @pytest.mark.usefixtures("as_fine_as_shipped")
-@pytest.mark.slow
 def test_steadiness_of_trials(tmp_path):
     """The last one is too short."""
     rng, files = np.random.default_rng(0), []
@@ -1330,7 +1307,6 @@ def muscle(tmp_path):
 
 
 @pytest.mark.usefixtures("as_fine_as_shipped")
-@pytest.mark.slow
 def test_a_designed_motion(muscle, tmp_path):
     result = run(
         "design",
@@ -1373,7 +1349,6 @@ def test_a_designed_motion(muscle, tmp_path):
         assert wrong.exit_code == 2 and message in wrong.stderr
 
 
-@pytest.mark.slow
 def test_how_to_play_and_fit_a_designed_motion_is_told(muscle, tmp_path, monkeypatch):
     """Above is what was designed, found by the command itself."""
     longer = designed()

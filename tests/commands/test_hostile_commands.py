@@ -151,7 +151,6 @@ NAMES = {
 }
 
 
-@pytest.mark.slow
 def test_fits_of_many_targets_stay_in_their_folder(tmp_path, monkeypatch):
     """Whatever the targets are called; the numbers of the fit are not what is tested."""
     inner = tmp_path / "in" / "ner"

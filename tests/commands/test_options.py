@@ -133,7 +133,6 @@ def cases(command: str) -> list[tuple[str, str, list[str]]]:
     return found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", VALID)
 def test_a_wrong_value_is_one_sentence(command, here):
     wrong = []

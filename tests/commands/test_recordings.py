@@ -69,7 +69,6 @@ def paths(folder, count=5):
 
 
 @pytest.mark.usefixtures("as_fine_as_shipped")
-@pytest.mark.slow
 def test_trials_are_analysed_together(folder, tmp_path):
     found = run(
         "analyse",
@@ -102,7 +101,6 @@ def test_trials_are_analysed_together(folder, tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_a_column_for_each_trial(folder, tmp_path):
     found = run("analyse", folder / "all.csv", "--column", "all", "--out", tmp_path, "--json")
     assert found.exit_code == 0, found.output
@@ -176,7 +174,6 @@ def test_a_command_reads_a_file_once(folder, tmp_path, read):
     assert force.unit == "N" and read == [path]
 
 
-@pytest.mark.slow
 def test_two_commands_from_raw_trials_to_a_fit(folder, tmp_path):
     """The mean of the fit is that of the recordings within its error."""
     target = tmp_path / "anna.toml"

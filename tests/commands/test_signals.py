@@ -89,7 +89,6 @@ time.sleep(60)""",
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", ALONE)
 def test_without_a_command(case):
     text, code = ALONE[case]
@@ -120,7 +119,6 @@ with signals.heard():
     assert ended(begun(code), 130).strip() == "interrupted"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("module", ["typer", pytest.param("jax", marks=pytest.mark.slow)])
 def test_while_a_module_is_imported(module, tmp_path):
     """Of the command, and of what a fit needs."""
@@ -139,7 +137,6 @@ main()"""
     assert not list(tmp_path.rglob("*.*"))
 
 
-@pytest.mark.slow
 def test_while_a_compiled_program_runs():
     """It never ends, and Python gets no turn."""
     code = """
@@ -158,7 +155,6 @@ with signals.heard():
     assert ended(process, 143) == "interrupted: nothing was written\n"
 
 
-@pytest.mark.slow
 def test_in_the_middle_of_an_ensemble(tmp_path):
     arguments = [
         "ensemble",
@@ -182,7 +178,6 @@ def test_in_the_middle_of_an_ensemble(tmp_path):
     assert attributes is not None and not attributes["complete"]
 
 
-@pytest.mark.slow
 def test_an_interrupted_reduction_keeps_every_chunk(tmp_path):
     """And not what the last copy on disk had, ten seconds before."""
     chunks = []

@@ -45,7 +45,6 @@ def test_mistakes(options, message, table, tmp_path):
     assert not (tmp_path / "out" / "study.json").exists()
 
 
-@pytest.mark.slow
 def test_a_study_is_overwritten_only_with_force(table, tmp_path, monkeypatch):
     asked = {}
 

@@ -104,7 +104,6 @@ def test_colours_that_differ_are_told_apart(colour):
     )
 
 
-@pytest.mark.slow
 def test_a_noise_and_its_limit_are_not_told_apart():
     """Ornstein-Uhlenbeck noise of short correlation time is as flat in the band as band-limited
     noise."""
@@ -142,7 +141,6 @@ def test_a_tremor_is_told_from_a_line():
     )
 
 
-@pytest.mark.slow
 def test_no_harmonic_is_shown_where_there_is_none():
     assert compared("pink", 3, False).harmonic.winner is None
 
@@ -165,7 +163,6 @@ def test_white_and_band_limited_noise_differ_only_above_the_band():
 # --- its numbers
 
 
-@pytest.mark.slow
 def test_likelihood_and_criterion_against_another_way(x64):
     """p by the numerical Hessian of the likelihood, which is the Fisher information where the model
     fits exactly."""
@@ -233,7 +230,6 @@ def test_effective_parameters_of_a_ridge_regression():
     )
 
 
-@pytest.mark.slow
 def test_a_bin_that_was_left_out_against_a_fit_by_scipy(x64):
     """Refitted without its group by Nelder and Mead on the likelihood that was integrated over the
     offset by quadrature."""
@@ -284,7 +280,6 @@ def test_a_bin_that_was_left_out_against_a_fit_by_scipy(x64):
     assert score == pytest.approx(marginal(more, power) - marginal(bins, power), abs=0.05)
 
 
-@pytest.mark.slow
 def test_every_bin_is_left_out_once_and_put_back_alone():
     target = target_of(true_task("pink"))
     folds = Folds.of([target, target], GROUPS)
@@ -311,7 +306,6 @@ def test_without_harmonic_its_power_is_zero(x64):
     assert len(Candidate.of(problem, harmonic=True).starts) >= 32
 
 
-@pytest.mark.slow
 def test_a_richer_model_is_also_sought_from_where_the_best_poorer_one_ended(x64):
     """From the prior's centre alone a muscle that rings at the tremor's frequency was missed by 100
     in AIC."""
@@ -377,7 +371,6 @@ def made(*, disagree=False, sigma=False, success=True, p=0.2):
     )
 
 
-@pytest.mark.slow
 def test_differences_and_weights():
     found = made()
     by = {(row.noise, row.harmonic): row for row in found.rows}
@@ -573,14 +566,12 @@ def test_bad_arguments(case):
         jm.compare_noise(task(), jm.load_target(FORCE), **options)
 
 
-@pytest.mark.slow
 def test_a_target_has_to_say_how_much_it_scatters():
     target = jm.Target("mine", 1 / np.arange(1, 31))
     with pytest.raises(ValueError, match="mine: states neither segments nor sigma"):
         jm.compare_noise(jm.Isometric(), target)
 
 
-@pytest.mark.slow
 def test_with_a_sigma_alone_nothing_is_held_out():
     exact = target_of(true_task("ornstein-uhlenbeck", harmonic_amplitude=0.0))
     target = jm.Target(
@@ -612,7 +603,6 @@ def keep_cache():
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("success", [True, False])
 def test_the_command_writes_its_files(success, tmp_path, monkeypatch, keep_cache):
     asked = {}

@@ -485,7 +485,6 @@ BAD_PROJECTS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", BAD_PROJECTS)
 def test_bad_projects(case, linear, tmp_path):
     make, options, message = BAD_PROJECTS[case]
@@ -603,7 +602,6 @@ def test_command_passes_dataset_and_axis_on(made, tmp_path, monkeypatch):
     assert CliRunner().invoke(app, ["fit", str(path)]).exit_code == 2
 
 
-@pytest.mark.slow
 def test_worked_example_of_the_how_to(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert pages.run("docs/digitise.md")["result"].success

@@ -109,7 +109,6 @@ def test_several_tapers_are_added_up():
     np.testing.assert_allclose(found.value, cross / power, rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_errors_of_few_segments_are_not_too_small():
     """Of four segments the response takes up one; without that the stated variance would be a
     quarter too small."""
@@ -575,7 +574,6 @@ def analyse(*arguments):
     return found.exit_code, " ".join(found.output.split())
 
 
-@pytest.mark.slow
 def test_the_command(file, tmp_path):
     columns = "--force-column", "force_N", "--displacement", "displacement_mm", "--out", tmp_path
     code, text = analyse(file, *columns)

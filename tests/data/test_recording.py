@@ -145,7 +145,6 @@ def test_no_plateau_is_said(case):
         Recording(NO_PLATEAU[case], 100, name=case).steady()
 
 
-@pytest.mark.slow
 def test_summary_against_its_sources():
     import antropy  # takes 7 s: not in every worker
 
@@ -264,7 +263,6 @@ def test_own_settings():
     assert recording.target(settings=settings).settings == settings
 
 
-@pytest.mark.slow
 def test_spectra_by_name():
     recording = Recording(noisy(rate=200), 200)
     for name in ("standard", "slow", "multitaper"):
@@ -373,7 +371,6 @@ def test_refused(case):
     assert message in str(caught.value)
 
 
-@pytest.mark.slow
 def test_figure():
     x, _ = ramp_and_hold()
     figure = Recording(x, 500, name="trial", source="$a_b$").steady().plot()

@@ -221,7 +221,6 @@ ARRAYS = [("npz", name) for name in ("force", "Data:0", "Data:-4")]
 ARRAYS += [("mat", name) for name in ("force", "Data:0", "Cell:0", "trial.force")]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "column"), ARRAYS)
 def test_arrays(kind, column, tmp_path):
     recording = load_recording(arrays(tmp_path, kind), column=column)
@@ -237,7 +236,6 @@ def test_stated_rate_gives_way(tmp_path):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(-1,), (-1, 1), (1, -1)])
 def test_npy(shape, tmp_path):
     np.save(tmp_path / "a.npy", X.reshape(shape))
@@ -251,7 +249,6 @@ def test_npy(shape, tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_mat_in_version_73(tmp_path):
     path = tmp_path / "trial.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
@@ -534,7 +531,6 @@ BAD_FILES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", BAD_FILES)
 def test_bad_files(case, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -629,7 +625,6 @@ def trial(folder):
     return write(folder, text(t, force.round(5), header="time,force (N)"))
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("as_fine_as_shipped")
 def test_command(tmp_path):
     path, out = trial(tmp_path), tmp_path / "out"

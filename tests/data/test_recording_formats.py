@@ -435,7 +435,6 @@ def test_bad_tables(frame, message):
     assert message in str(caught.value)
 
 
-@pytest.mark.slow
 def test_xlsx(tmp_path):
     pytest.importorskip("openpyxl")
     frame = pandas.DataFrame({"Zeit": ["s", *TIME], "Kraft": ["N", *X]})
@@ -555,7 +554,6 @@ def test_without_library(kind, tmp_path, monkeypatch):
         load_recording(write(tmp_path, b"any", f"trial.{kind}"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", LIBRARIES)
 def test_damaged_files(kind, tmp_path):
     pytest.importorskip(LIBRARIES[kind])
@@ -567,7 +565,6 @@ LONG = 80_000  # rows: more than are read at once
 BYTES_PER_ROW = 120
 
 
-@pytest.mark.slow
 def test_memory_of_text(tmp_path):
     """What Python and NumPy allocate at most while a text is read, the text itself included."""
     force = np.round(np.resize(X, LONG), 4)

@@ -148,7 +148,6 @@ def simulated():
     ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("low, high", [edges for edges in RANGES.values() if edges[1] < 20])
 def test_band_powers_are_the_integral_of_the_density(low, high):
     """The mean over recordings within 4.5 standard errors; the mean of a record takes half an
@@ -178,7 +177,6 @@ SURE = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SURE)
 def test_errors_of_one_recording_are_the_scatter_of_many(name):
     """The scatter of 100 is known to 7 %, and the errors are 0.85 to 1.05 of it
@@ -211,7 +209,6 @@ def test_three_trials_scatter_and_two_do_not(found):
         assert two[name].error_from == two.trials["trial 0"][name].error_from
 
 
-@pytest.mark.slow
 def test_the_interval_is_that_of_student(found):
     """With t the interval holds the expected value in 95 % of a thousand people with five trials,
     with 1.96 in 88 %."""
@@ -561,7 +558,6 @@ def held(name, truth, measures):
     return sum(m[name].interval[0] <= truth <= m[name].interval[1] for m in measures)
 
 
-@pytest.mark.slow
 def test_intervals_of_the_mean_hold_it(without_entropies):
     """Of a white signal the four slowest ordinates and the mean are independent, so t is exact;
     1.96 errors hold 88 %."""
@@ -581,7 +577,6 @@ def recordings_of_20_s(without_entropies):
     return [_stated(_own(x, "N"), 1, 2) for x in forces(200, 20.0, seed=7)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["power_0_0.5", "power_0.5_1", "power_1_2", "share_0.5_1", CV])
 def test_intervals_of_a_power_hold_it(name, recordings_of_20_s):
     """91 % or more by the table in docs/recordings.md, of which 1 % is chance."""

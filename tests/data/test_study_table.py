@@ -129,7 +129,6 @@ def test_every_way_to_read_a_file_can_be_stated(where, exported):
         np.testing.assert_array_equal(cell.target.proportional_power, wanted.proportional_power)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [

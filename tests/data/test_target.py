@@ -546,7 +546,6 @@ POINTS = st.lists(POINT, max_size=40).map(lambda points: [(5.05, 2.0), *points, 
 
 
 @given(points=POINTS, data=st.data())
-@pytest.mark.slow
 def test_valid_csv_loads_whatever_the_order(points, data, tmp_path_factory):
     path = tmp_path_factory.mktemp("csv") / "points.csv"
     path.write_text(csv_text(*zip(*points, strict=True), header=""))
@@ -559,7 +558,6 @@ def test_valid_csv_loads_whatever_the_order(points, data, tmp_path_factory):
     assert load_target(path.with_suffix(".toml")) == target
 
 
-@pytest.mark.slow
 @given(points=POINTS)
 def test_sorted_csv_with_header_stays_between_its_points(points, tmp_path_factory):
     frequency, power = np.array(sorted(dict(points).items())).T

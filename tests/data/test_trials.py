@@ -68,7 +68,6 @@ def test_absolute_spectra_are_averaged_with_their_segments():
     )
 
 
-@pytest.mark.slow
 def test_what_several_trials_say_is_said_once():
     """The steady parts in one notice; else with the names of those that say it, unless all do."""
     rng, rise = np.random.default_rng(7), LEVEL * np.linspace(0, 1, RATE)
@@ -107,7 +106,6 @@ def scatter(made):
     return np.sum((z / law.sd) ** 2) / (len(made) - 1) / expected
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("spread", "drift"), [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5)])
 def test_dispersion_is_how_much_more_the_averages_scatter(spread, drift):
     """Of 60 people with five trials: the dispersion that each states against the scatter of the 60
@@ -163,7 +161,6 @@ def test_saved_and_read_back_equal(tmp_path):
     assert "5 trials" in str(again) or "10 + 10 + 10 + 10 + 10" in str(again)
 
 
-@pytest.mark.slow
 def test_mean_force_and_its_error():
     """Against the scatter of the means of 200 trials of a first-order process, whose means scatter
     as `√(S(0) / 2T)`."""
@@ -493,7 +490,6 @@ def strong():
         return found, jm.fit(jm.Isometric(), found, rungs=0, seeds=0, check_seeds=0, starts=8)
 
 
-@pytest.mark.slow
 def test_a_fit_has_the_measured_mean(strong):
     """The mean of a fit is the recordings' within its error, P_w follows, and everything else is as
     without newtons."""
@@ -525,7 +521,6 @@ def test_a_fit_has_the_measured_mean(strong):
         assert result.derived[name].value == pytest.approx(without.derived[name].value, rel=0.05)
 
 
-@pytest.mark.slow
 def test_profile_and_reopening_keep_the_mean(strong):
     _, result = strong
     found = jm.profile(result, "mean")
@@ -534,7 +529,6 @@ def test_profile_and_reopening_keep_the_mean(strong):
     assert (high - low) / 2 == pytest.approx(1.96 * result.derived["mean"].stderr, rel=0.2)
 
 
-@pytest.mark.slow
 def test_a_joint_fit_at_two_forces():
     """One muscle at two drives: stiffness is shared, every P_w follows its own mean."""
     weak = jm.at_force(jm.Isometric(), 20.0)

@@ -121,7 +121,6 @@ def test_a_quantile_beyond_the_cells_is_not_made_up():
 # Reduced ensembles
 
 
-@pytest.mark.slow
 def test_a_reduced_ensemble_has_the_moments_of_the_whole_one():
     runs = jm.ensemble(TASK, KEY, seeds=30, chunk=8)
     output = np.asarray(runs.output, float)
@@ -154,7 +153,6 @@ def test_a_reduced_ensemble_has_the_moments_of_the_whole_one():
     assert ax.get_ylabel().endswith("(N)") and len(ax.collections) == 1
 
 
-@pytest.mark.slow
 def test_a_stored_summary_is_the_one_in_memory(tmp_path):
     options: Any = {"seeds": 4, "duration": 15.0, "reduce": True}
     found = jm.ensemble(TASK, KEY, **options)
@@ -164,7 +162,6 @@ def test_a_stored_summary_is_the_one_in_memory(tmp_path):
     assert str(stored) == str(found)
 
 
-@pytest.mark.slow
 def test_a_run_too_short_for_a_spectrum_has_none():
     found = jm.ensemble(TASK, KEY, seeds=3, reduce=True, **SHORT)
     assert found.spectra == () and found.mean.shape == (101,)
@@ -172,7 +169,6 @@ def test_a_run_too_short_for_a_spectrum_has_none():
         _ = found.spectrum
 
 
-@pytest.mark.slow
 def test_what_breaks_is_left_out_and_named():
     runs = jm.ensemble(BRITTLE, KEY, seeds=40, reduce=True, **SHORT)
     assert 3 < len(runs.failed) < 37  # else the test shows nothing
@@ -187,7 +183,6 @@ def test_what_breaks_is_left_out_and_named():
     assert not runs.success and f"{len(broken)} seed(s) did not stay finite" in runs.message
 
 
-@pytest.mark.slow
 def test_where_nothing_is_left_nothing_is_said():
     broken = Brittle(
         noise=jm.OrnsteinUhlenbeckNoise(50.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0)
@@ -205,7 +200,6 @@ def test_where_nothing_is_left_nothing_is_said():
 # Sweeps
 
 
-@pytest.mark.slow
 def test_points_of_a_sweep_are_single_ensembles():
     sweep = jm.Sweep.grid(TASK, k_w=[4e5, 6e5], noise_K_w=[0.1, 0.2, 0.3])
     assert len(sweep) == 6 and sweep[1]["noise_K_w"] == 0.2 and sweep[5]["k_w"] == 6e5
@@ -219,7 +213,6 @@ def test_points_of_a_sweep_are_single_ensembles():
 
 
 @pytest.mark.parametrize("seeds, chunk", [(2, 8), (20, 8)])
-@pytest.mark.slow
 def test_a_reduced_sweep_has_the_moments_of_every_point(seeds, chunk):
     """With few seeds of many points at once, and with many seeds of a point in pieces."""
     sweep = jm.Sweep.design(TASK, {"k_w": [4e5, 5e5, 6e5, 7e5, 8e5]})
@@ -235,7 +228,6 @@ def test_a_reduced_sweep_has_the_moments_of_every_point(seeds, chunk):
     assert one["quantile_0.5"].item() == found.quantile[4, found.levels.index(0.5), 50]
 
 
-@pytest.mark.slow
 def test_persons_differ_in_numbers_only():
     persons = jm.Sweep.of([TASK, TASK.replace(m_w=0.3, c_w=90.0)], names=["first", "second"])
     assert set(persons.labels) == {"name", "m_w", "c_w"}
@@ -292,7 +284,6 @@ def test_bad_input_is_refused(make, message):
 # Stores
 
 
-@pytest.mark.slow
 def test_a_store_holds_what_memory_would(tmp_path):
     path = tmp_path / "runs.zarr"
     dataset = jm.ensemble(TASK, KEY, seeds=20, store=path, chunk=8, states=True)
@@ -317,7 +308,6 @@ def test_a_store_holds_what_memory_would(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["runs.zarr"]
 
 
-@pytest.mark.slow
 def test_a_store_of_a_sweep_has_points(tmp_path):
     sweep = jm.Sweep.grid(TASK, k_w=[4e5, 5e5, 6e5])
     for name, seeds in (("few", 2), ("many", 20)):
@@ -327,7 +317,6 @@ def test_a_store_of_a_sweep_has_points(tmp_path):
         np.testing.assert_array_equal(dataset.coords["k_w"], [4e5, 5e5, 6e5])
 
 
-@pytest.mark.slow
 def test_failed_seeds_are_marked_in_a_store(tmp_path):
     dataset = jm.ensemble(BRITTLE, KEY, seeds=40, store=tmp_path / "a", **SHORT)
     reduced = jm.ensemble(BRITTLE, KEY, seeds=40, reduce=True, store=tmp_path / "b", **SHORT)
@@ -352,7 +341,6 @@ def stopped_after(chunks):
     return tell
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("reduce", [False, True], ids=["trajectories", "reduced"])
 def test_an_interrupted_store_is_resumed(tmp_path, monkeypatch, reduce):
     monkeypatch.setattr(_ensemble_run, "KEEP_EVERY", 0.0)
@@ -407,7 +395,6 @@ def test_an_interrupted_store_is_resumed(tmp_path, monkeypatch, reduce):
     assert not (path / "progress").exists()
 
 
-@pytest.mark.slow
 def test_a_store_is_overwritten_once_nothing_else_is_wrong(tmp_path):
     path, kept = tmp_path / "a.zarr", tmp_path / "mine"
     given: Any = {"seeds": 8, **SHORT}
@@ -443,7 +430,6 @@ def test_a_store_is_overwritten_once_nothing_else_is_wrong(tmp_path):
     ],
     ids=lambda value: "" if isinstance(value, str) else next(iter(value)),
 )
-@pytest.mark.slow
 def test_a_store_of_other_settings_is_not_resumed(tmp_path, change, message):
     given = {"task": TASK, "key": KEY, "seeds": 20, "store": tmp_path / "a.zarr"} | SHORT
     with pytest.raises(Stop):
@@ -574,7 +560,6 @@ class Slow:
         return self.simulate(chunk, found)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 3])
 def test_threads_change_nothing(tmp_path, monkeypatch, threads):
     """To the last bit, in whatever order they end: in memory, reduced, stored, swept, with cells
@@ -843,7 +828,6 @@ print(before, peak_memory())
 """
 
 
-@pytest.mark.slow
 def test_memory_does_not_grow_with_the_seeds():
     before, after = map(int, ended(python(MEMORY))[0].split())
     assert 0 < after < 1.1 * before  # 16 times as many seeds
@@ -854,7 +838,6 @@ def test_memory_does_not_grow_with_the_seeds():
 RUNNER = CliRunner()
 
 
-@pytest.mark.slow
 def test_the_command_writes_resumes_and_refuses(tmp_path):
     path = tmp_path / "runs.zarr"
     arguments = [
@@ -884,7 +867,6 @@ def test_the_command_writes_resumes_and_refuses(tmp_path):
     assert replaced.exit_code == 0 and xarray.open_zarr(path).attrs["task"] == "PrescribedMotion"
 
 
-@pytest.mark.slow
 def test_the_command_speaks_json(tmp_path):
     arguments = [
         "--seeds",
@@ -936,7 +918,6 @@ def test_the_command_refuses_bad_input(tmp_path, arguments, message):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
 def test_the_speed_of_this_machine():
     found = json.loads(ended(command("speed", "--seeds", "16", "--duration", "0.2", "--json"))[0])
     assert found["compile_s"] > 0 and found["seeds_per_s"] > 0

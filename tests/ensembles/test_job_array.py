@@ -48,7 +48,6 @@ def same_as_one_run(found, seeds, kept):
 # Who does what
 
 
-@pytest.mark.slow
 @hypothesis.given(st.integers(0, 500), st.integers(1, 40))
 def test_every_chunk_is_in_one_part(chunks, count):
     shares = [Part(number, count).chunks(chunks) for number in range(1, count + 1)]
@@ -83,7 +82,6 @@ def test_a_part_does_not_depend_on_the_devices(monkeypatch):
 # Parts and their merging
 
 
-@pytest.mark.slow
 @KINDS
 def test_parts_in_any_order_are_one_run(anywhere, kept):
     given: Any = {"seeds": 45, "store": anywhere, **SHORT, **kept}
@@ -115,7 +113,6 @@ def test_parts_in_any_order_are_one_run(anywhere, kept):
     assert not place_of(anywhere).progress()
 
 
-@pytest.mark.slow
 def test_merged_spectra_are_those_of_one_run(tmp_path):
     """With the control variate, whose expectation the store knows."""
     given: Any = {"seeds": 24, "reduce": True, "chunk": 8}
@@ -135,7 +132,6 @@ def test_merged_spectra_are_those_of_one_run(tmp_path):
     np.testing.assert_array_equal(opened.spectrum.power, merged["power"])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [2, 20], ids=["points together", "points in pieces"])
 def test_parts_of_a_sweep(tmp_path, seeds):
     sweep = jm.Sweep.grid(TASK, k_w=[4e5, 5e5, 6e5, 7e5, 8e5])
@@ -148,7 +144,6 @@ def test_parts_of_a_sweep(tmp_path, seeds):
     np.testing.assert_array_equal(merged.coords["k_w"], sweep.labels["k_w"])
 
 
-@pytest.mark.slow
 @KINDS
 def test_what_fails_in_a_part_is_named_by_it_and_in_the_end(tmp_path, kept):
     given: Any = {"seeds": 40, "store": tmp_path / "a.zarr", **SHORT, **kept}
@@ -162,7 +157,6 @@ def test_what_fails_in_a_part_is_named_by_it_and_in_the_end(tmp_path, kept):
     np.testing.assert_array_equal(whole.failed, failed)
 
 
-@pytest.mark.slow
 @KINDS
 def test_a_part_that_was_stopped_goes_on(anywhere, monkeypatch, kept):
     monkeypatch.setattr(_ensemble_run, "KEEP_EVERY", 0.0)
@@ -179,7 +173,6 @@ def test_a_part_that_was_stopped_goes_on(anywhere, monkeypatch, kept):
     same_as_one_run(jm.ensembles.merge(anywhere), 96, kept)
 
 
-@pytest.mark.slow
 @KINDS
 @pytest.mark.parametrize("change", [{}, {"seeds": 17}], ids=["same settings", "other settings"])
 def test_two_parts_begin_at_the_same_moment(anywhere, monkeypatch, kept, change):
@@ -335,7 +328,6 @@ def test_commands_that_begin_together(tmp_path):
 # The command
 
 
-@pytest.mark.slow
 def test_the_command_makes_a_part_and_merges(tmp_path):
     path = tmp_path / "a.zarr"
     arguments = [
@@ -450,7 +442,6 @@ def test_a_store_at_a_url_is_resumed_and_overwritten(tmp_path, monkeypatch, kept
     assert not (tmp_path / "a.zarr").exists()
 
 
-@pytest.mark.slow
 def test_parts_begin_together_at_a_url(tmp_path):
     """Several times: it depends on the moment."""
     for turn in range(5):

@@ -68,7 +68,6 @@ def flipped(data, bit):
 # What is damaged is noticed
 
 
-@pytest.mark.slow
 @KINDS
 def test_a_hundred_flipped_bits_are_noticed(tmp_path, kept):
     """Of chunks, at random places: by the package, and by whoever reads the chunk through
@@ -143,7 +142,6 @@ class Broken(Brittle):
         return jnp.where(jnp.abs(u[:1]) > 1e-6, jnp.inf, u[:1]) - y
 
 
-@pytest.mark.slow
 def test_a_chunk_of_nothing_but_nan_is_there(tmp_path):
     task = Broken(
         noise=jm.OrnsteinUhlenbeckNoise(1.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0)
@@ -201,7 +199,6 @@ def test_a_damaged_store_is_mended_bit_by_bit(tmp_path, kept, parts, caplog):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.zarr"]
 
 
-@pytest.mark.slow
 def test_the_command_mends(tmp_path, capfd):
     import test_ensemble
 

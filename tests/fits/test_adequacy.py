@@ -51,7 +51,6 @@ def with_band(share: float, frequency: float = 9.0, width: float = 2.0) -> np.nd
 # --- chi² and its distribution
 
 
-@pytest.mark.slow
 def test_without_harmonic_and_correlation_chi_squared_has_its_distribution(x64):
     """Gaussian log powers of known spread, three nearly flat priors: chi² with 30 - 1 - 3 degrees
     of freedom."""
@@ -90,7 +89,6 @@ def test_what_the_fitted_directions_take_up_is_removed():
     )
 
 
-@pytest.mark.slow
 def test_a_line_in_the_bins_is_that_of_a_sine(x64):
     """Mean over 16 phases of the Welch power of √2 sin, mean square 1, without the low-pass."""
     settings = jm.SpectrumSettings(filter_cutoff=None)
@@ -130,7 +128,6 @@ def missed() -> jm.fits.FitResult:
     return jm.fit(TASK, drawn(60, 3, with_band(0.1)), rungs=0, **QUICK)
 
 
-@pytest.mark.slow
 def test_a_band_of_tremor_is_found_and_named():
     """A line of zero width is no tremor: ten percent of the power at 9 Hz, 2 Hz wide, in 60
     segments."""
@@ -181,7 +178,6 @@ def test_a_run_has_no_bin_that_is_clearly_off_the_other_way(x64):
     )
 
 
-@pytest.mark.slow
 def test_errors_of_such_a_fit_are_widened_and_its_harmonic_is_not_judged():
     result = missed()
     factor = result.adequacy.widening
@@ -205,7 +201,6 @@ def test_errors_of_such_a_fit_are_widened_and_its_harmonic_is_not_judged():
     assert any("no p-value of the harmonic" in sentence for sentence in result.advice)
 
 
-@pytest.mark.slow
 def test_what_was_measured_is_as_certain_as_its_measurement():
     """The mean and its error are data. That the spectrum is missed widens the other errors, not
     this one."""
@@ -218,7 +213,6 @@ def test_what_was_measured_is_as_certain_as_its_measurement():
     assert result.advice[0].endswith(". Not widened, since measured directly: mean")
 
 
-@pytest.mark.slow
 def test_a_good_fit_is_called_so():
     """The same spectrum without the band: one in a hundred would be missed, this one is not."""
     result = jm.fit(TASK, drawn(60, 3), **QUICK)
@@ -226,7 +220,6 @@ def test_a_good_fit_is_called_so():
     assert result.verdict.startswith("describes the data: ")
 
 
-@pytest.mark.slow
 def test_nothing_is_judged_where_the_scatter_is_unknown():
     target = jm.Target("no spread", own_power())
     with jax.enable_x64(True):
@@ -239,7 +232,6 @@ def test_nothing_is_judged_where_the_scatter_is_unknown():
 # --- what is stated
 
 
-@pytest.mark.slow
 def test_a_faint_harmonic_has_no_errors_and_a_strong_one_has(x64):
     shares = {}
     for amplitude in (0.003, 0.05):
@@ -255,7 +247,6 @@ def test_a_faint_harmonic_has_no_errors_and_a_strong_one_has(x64):
     assert shares[0.003] > 0.5 and shares[0.05] < 1e-3
 
 
-@pytest.mark.slow
 def test_an_interval_ends_where_the_profile_says(x64):
     """Against scipy's constrained minimum of the same cost, for the noise that one target and two
     parameters allow."""
@@ -289,7 +280,6 @@ def test_an_interval_ends_where_the_profile_says(x64):
     assert ends.about(2.0)[1] == pytest.approx(2.0 * np.exp(ends.high))
 
 
-@pytest.mark.slow
 def test_one_criterion_for_a_parameter_and_for_what_is_the_same_number():
     """C_w0 = c_w v_ref²: with the rest known both have an error, of the same size in percent; else
     neither."""
@@ -317,7 +307,6 @@ def test_a_mean_force_that_nothing_can_reach_is_refused():
         jm.fit(TASK, drawn(12, 1), mean_force=(120.0, 3.0))
 
 
-@pytest.mark.slow
 def test_a_mean_force_in_newtons_is_met_by_the_carried_muscle():
     task = jm.at_force(TASK, 120.0)
     result = jm.fit(task, drawn(12, 1), mean_force=(120.0, 1.0), **QUICK)
@@ -325,7 +314,6 @@ def test_a_mean_force_in_newtons_is_met_by_the_carried_muscle():
     assert abs(result.only.further["mean"]) < 2 and result.per_newton == {}
 
 
-@pytest.mark.slow
 def test_a_mean_force_that_the_spectrum_contradicts_is_said():
     """Stiffnesses held: the mean is 2.2 N whatever the noise, 20 stated errors from what is
     asked."""
@@ -335,7 +323,6 @@ def test_a_mean_force_that_the_spectrum_contradicts_is_said():
     assert any("standard deviations below the given one" in notice for notice in result.notices)
 
 
-@pytest.mark.slow
 def test_the_active_force_may_be_free_with_a_prior_in_ratio():
     """The muscle's own mean is 2.2 N at P_w = 5 N; 4 N asks for about 9 N with the stiffnesses
     held."""
@@ -356,7 +343,6 @@ def test_the_active_force_may_be_free_with_a_prior_in_ratio():
     assert result.parameters["P_w"].value > 8
 
 
-@pytest.mark.slow
 def test_quantities_that_are_observed_are_those_of_the_fit():
     result = jm.fit(TASK, drawn(12, 2), **QUICK)
     with jax.enable_x64(True):
@@ -372,7 +358,6 @@ def test_quantities_that_are_observed_are_those_of_the_fit():
             assert (low is None or low < p.value) and (high is None or high > p.value)
 
 
-@pytest.mark.slow
 def test_the_power_in_bands_has_intervals():
     """The highest ten of the bins are the floor and, with 2 % of the bin below them, a band."""
     result = jm.fit(TASK, drawn(12, 2), **QUICK)

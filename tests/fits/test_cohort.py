@@ -98,7 +98,6 @@ def test_what_the_data_determine_is_recovered():
     assert np.sqrt(np.mean(np.square(deviations))) < 1.8
 
 
-@pytest.mark.slow
 def test_each_target_is_fitted_as_if_alone():
     with without_intervals():
         alone = jm.fit(jm.task_for(people()[3]), people()[3], starts=16, check_seeds=0, rungs=0)
@@ -112,7 +111,6 @@ def test_each_target_is_fitted_as_if_alone():
             assert together.derived[name].stderr == pytest.approx(estimate.stderr, rel=0.2), name
 
 
-@pytest.mark.slow
 def test_groups_differ_by_what_they_were_given():
     found = {d.quantity: d for d in cohort().differences()}
     d = found["harmonic_frequency"]
@@ -130,7 +128,6 @@ def test_groups_differ_by_what_they_were_given():
     np.testing.assert_allclose((d.low, d.high), (interval.low, interval.high), rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_member_says_what_was_not_done():
     member = cohort().results["person0"]
     assert (member.settings["seeds"], member.settings["check_seeds"]) == (0, 0)
@@ -167,7 +164,6 @@ def test_a_cohort_has_one_method():
         jm.fit_cohort(["vastus-lateralis-26mvc"], method="montecarlo")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("by", ["person", "group", "level"])
 def test_the_figure(by):
     figure = cohort().plot(by)
@@ -250,7 +246,6 @@ def test_single_members_are_compared_by_their_standard_errors():
         )
 
 
-@pytest.mark.slow
 def test_one_bad_target_does_not_stop_the_rest(tmp_path):
     few = jm.Target("few", np.array([0.5, 0.3, 0.2]), bins=np.array([1, 2, 3]), segments=12)
     good = jm.load_target("fdi-abduction-45mvc")
@@ -303,7 +298,6 @@ def command(*arguments):
     return result
 
 
-@pytest.mark.slow
 def test_the_command_writes_a_folder_for_each_and_the_table(tmp_path):
     groups = tmp_path / "groups.csv"
     groups.write_text("target,group\nvastus-lateralis-26mvc,knee\nfdi-abduction-45mvc,finger\n")

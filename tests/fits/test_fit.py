@@ -90,7 +90,6 @@ def part_of(problem, seeds=8):
 # --- the spectrum as one matrix
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -251,7 +250,6 @@ def test_a_frequency_with_a_prior_of_its_own_comes_back():
     )
 
 
-@pytest.mark.slow
 @given(theta=st.lists(st.floats(-0.8, 0.8), min_size=5, max_size=5))
 def test_from_theta_is_the_reverse_of_theta(theta):
     with jax.enable_x64(True):
@@ -260,7 +258,6 @@ def test_from_theta_is_the_reverse_of_theta(theta):
         np.testing.assert_allclose(again, theta, atol=1e-12)
 
 
-@pytest.mark.slow
 @given(s=st.lists(st.floats(-1e6, 1e6), min_size=5, max_size=5))
 def test_bounds_hold_wherever_the_coordinates_go(s):
     with jax.enable_x64(True):
@@ -415,7 +412,6 @@ def test_descent_takes_the_problem_that_prepare_gives(x64):
     np.testing.assert_allclose(found.s, 2.0, atol=1e-6)
 
 
-@pytest.mark.slow
 def test_residuals_and_their_slopes_are_exact_where_the_model_was_seen(x64):
     objective, s = Curved(), np.array([[0.4, -0.3], [1.2, 0.7]])
     seen = expand(objective, s)
@@ -460,7 +456,6 @@ def _seen():
 
 
 @pytest.mark.parametrize("residual", RESIDUALS)
-@pytest.mark.slow
 def test_gradients_of_the_residuals_are_differences(x64, residual):
     objective, s, seen = _problem(residual, EXTRA), jnp.asarray(AT), _seen()
 
@@ -481,7 +476,6 @@ def test_gradients_of_the_residuals_are_differences(x64, residual):
     assert forward.shape == (bins + 2 + 3, 3)
 
 
-@pytest.mark.slow
 def test_slopes_that_were_seen_are_those_of_the_whole(x64):
     """Every batch of points has one program for moments and slopes; here the residuals are
     differentiated in one piece."""
@@ -497,7 +491,6 @@ def test_slopes_that_were_seen_are_those_of_the_whole(x64):
     np.testing.assert_allclose(forward, at_once(jax.jacfwd(whole), s), rtol=1e-6, atol=6e-8)
 
 
-@pytest.mark.slow
 def test_the_extra_residuals_are_log_variation_and_mean(x64):
     (objective,) = _problem("log", EXTRA).parts
     moments = _moments(jnp.zeros(3))
@@ -506,7 +499,6 @@ def test_the_extra_residuals_are_log_variation_and_mean(x64):
     np.testing.assert_allclose(rows, expected)
 
 
-@pytest.mark.slow
 def test_the_residuals_vanish_for_a_target_that_the_model_makes(x64):
     for residual in RESIDUALS:
         (objective,) = _problem(residual).parts
@@ -518,7 +510,6 @@ def test_the_residuals_vanish_for_a_target_that_the_model_makes(x64):
         assert np.abs(shifted).max() > 0.1
 
 
-@pytest.mark.slow
 def test_linear_and_cumulative_residuals_are_in_standard_deviations(x64):
     """Of simulated spectra about their expectation, p_k and its running sum."""
     segments = 12
@@ -546,7 +537,6 @@ def null_sentences(task, extra):
     return common_scales(DEFAULT_FREE, identifiability(consequences(objective, seen).jacobian))
 
 
-@pytest.mark.slow
 def test_the_measured_variation_fixes_the_scale(x64):
     """Design 8: both null directions are named, and a coefficient of variation takes the first
     away."""
@@ -559,7 +549,6 @@ def test_the_measured_variation_fixes_the_scale(x64):
     assert PERTURBATION not in fixed and MECHANICS in fixed
 
 
-@pytest.mark.slow
 def test_stiff_points_get_substeps(x64):
     """c_w / m_w = 4000/s: λ dt = 10 on the grid of the fit, which Heun's method does not
     survive."""
@@ -680,7 +669,6 @@ def test_bad_arguments_are_named(arguments, message):
         jm.fit(jm.Isometric(), simple_target(), **arguments)
 
 
-@pytest.mark.slow
 def test_a_task_that_does_not_fluctuate():
     still = jm.Isometric(noise=jm.BandLimitedNoise(0.0), harmonic=jm.Harmonic(amplitude=0.0))
     with pytest.raises(ValueError, match="neither noise nor a harmonic"):
@@ -795,7 +783,6 @@ def test_what_the_data_determine_is_recovered(x64, task):
 
 
 @pytest.mark.parametrize("task", [FIRST, SECOND], ids=["first", "second"])
-@pytest.mark.slow
 def test_three_free_parameters_are_recovered(x64, task):
     with without_intervals():
         result = jm.fit(off(task, FREE), averaged(task), free=FREE, **RECOVERY)
@@ -857,7 +844,6 @@ def quick_fit(**arguments):
     return jm.fit(jm.Isometric(), simple_target(), free=FEW, **QUICK, **arguments)
 
 
-@pytest.mark.slow
 def test_one_failing_start_does_not_stop_the_others(monkeypatch):
     made = _search.starting_points
 
@@ -873,7 +859,6 @@ def test_one_failing_start_does_not_stop_the_others(monkeypatch):
     assert result.starts[1].cost is not None
 
 
-@pytest.mark.slow
 def test_the_same_seed_gives_the_same_fit():
     first, again = (
         quick_fit(),
@@ -886,7 +871,6 @@ def test_the_same_seed_gives_the_same_fit():
     assert first.seed == 0 and again.seed is None
 
 
-@pytest.mark.slow
 def test_a_fit_is_in_double_precision_whatever_the_callers():
     assert not jax.config.jax_enable_x64
     result = quick_fit()
@@ -896,7 +880,6 @@ def test_a_fit_is_in_double_precision_whatever_the_callers():
     assert float(np.float32(value)) != value
 
 
-@pytest.mark.slow
 def test_progress_is_told_up_to_the_end():
     told = []
     found = jm.fit(
@@ -915,7 +898,6 @@ def test_progress_is_told_up_to_the_end():
         assert any(stage in text for text, _ in told)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["searching from", "correcting by"])
 def test_an_interrupted_fit_holds_what_had_been_reached(stage):
     count = 0
@@ -938,7 +920,6 @@ def test_an_interrupted_fit_holds_what_had_been_reached(stage):
     assert all(start.steps <= (2 if stage == "searching from" else 12) for start in result.starts)
 
 
-@pytest.mark.slow
 def test_the_answer_comes_before_the_checks_and_an_interruption_in_them_keeps_it():
     order, given = [], {"free": FEW, "key": 0, **QUICK}
 
@@ -970,7 +951,6 @@ def test_the_answer_comes_before_the_checks_and_an_interruption_in_them_keeps_it
     ]
 
 
-@pytest.mark.slow
 def test_an_interruption_between_the_search_and_the_answer_keeps_what_the_search_found(monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -994,7 +974,6 @@ def test_an_interruption_before_the_first_step_has_no_result():
     assert not isinstance(caught.value, jm.fits.FitInterrupted)
 
 
-@pytest.mark.slow
 def test_a_start_in_the_stiff_region_survives(x64):
     """c_w / m_w = 4000/s."""
     result = jm.fit(jm.Isometric().replace(c_w=2000.0), simple_target(), free=FEW, **QUICK)
@@ -1019,7 +998,6 @@ def test_what_a_fit_says_about_itself():
     np.testing.assert_allclose(result.fitted.sum(), 1.0)
 
 
-@pytest.mark.slow
 def test_monte_carlo_agrees_with_the_linear_fit():
     """The control variate leaves a dozen paths the error of thousands, so both minima are the
     same."""
@@ -1057,7 +1035,6 @@ def test_weak_increments_change_a_fit_by_its_monte_carlo_error_only(x64):
     np.testing.assert_array_equal(weak.only.stretch[1], np.asarray(shown)[-501:])
 
 
-@pytest.mark.slow
 def test_controlled_moments_are_those_of_a_controlled_ensemble(x64):
     """With weak increments, which the paths of a fit take over from its arguments."""
     options = FitOptions(free=FEW, method="montecarlo", increments="weak", dt=1e-3, key=3)
@@ -1086,7 +1063,6 @@ def test_any_number_of_points_is_one_compiled_program(x64):
     assert seen.slopes[0].power.shape == (BATCH + 5, 30, 3)
 
 
-@pytest.mark.slow
 def test_profile_and_bootstrap_find_a_line_that_is_there():
     """A spectrum of the model with a harmonic that holds its bin, and one without."""
     task = jm.Isometric().replace(harmonic_frequency=6.0, harmonic_amplitude=0.012)
@@ -1146,7 +1122,6 @@ def test_other_minima_in_frequency_are_polished_too(x64):
     assert contenders(other, ended(other.coordinates, [400.0, 500.0], [2.0, 1.0]), 9.0) == [1]
 
 
-@pytest.mark.slow
 def test_a_frequency_that_the_spectrum_leaves_open_is_called_ambiguous(x64):
     problem = setup_of(jm.Isometric(), VASTUS, ("harmonic_frequency",))
     close = ended(problem.coordinates, [3.9, 6.6], [5.0, 5.0 + 0.9 * AMBIGUOUS])
@@ -1160,7 +1135,6 @@ def test_a_frequency_that_the_spectrum_leaves_open_is_called_ambiguous(x64):
     )
 
 
-@pytest.mark.slow
 def test_two_equal_lines_make_the_frequency_ambiguous():
     """A target with the same hump at 4.3 and 8.6 Hz: whichever one the harmonic takes, the other
     fits as well."""
@@ -1179,7 +1153,6 @@ def test_two_equal_lines_make_the_frequency_ambiguous():
         )
 
 
-@pytest.mark.slow
 def test_mean_force_and_no_spread():
     """Half a percent of the mean, which k_z alone can move; nothing is known about the scatter of
     the bins."""

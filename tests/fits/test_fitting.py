@@ -34,7 +34,6 @@ def test_every_bundled_target_has_a_script_and_expected_results(scripts):
         assert len(lines) < 80
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["vastus-lateralis-26mvc", "fdi-abduction-45mvc"])
 def test_a_fit_with_a_fresh_seed_is_within_the_expected_tolerance(scripts, name):
     table = json.loads((FITTING / "expected" / f"{name}.json").read_text(encoding="utf-8"))
@@ -92,14 +91,12 @@ def test_the_preset_has_the_papers_amplitudes():
     assert task["harmonic_frequency"] == 4.25
 
 
-@pytest.mark.slow
 def test_the_preset_shows_the_papers_two_maxima(paper_force):
     found = jm.spectra.peaks(paper_force.mean())
     assert found.maximum.bin == 1
     assert [peak.bin for peak in found.local_maxima] == [11]
 
 
-@pytest.mark.slow
 def test_single_seeds_of_the_preset_show_both_maxima_more_often_than_not(paper_force, capsys):
     p = np.asarray(paper_force.proportional)
     both = (p.argmax(1) == 0) & (p[:, 10] > p[:, 9]) & (p[:, 10] > p[:, 11])
@@ -110,7 +107,6 @@ def test_single_seeds_of_the_preset_show_both_maxima_more_often_than_not(paper_f
     assert 0.5 < both.mean() < 0.9
 
 
-@pytest.mark.slow
 def test_the_presets_displacement_oscillates_about_the_cubics_root():
     task = jm.load_preset("zagrodny-slifkin").as_task(jm.PrescribedForce)
     k, x_ref, force = float(task["k_w"]), float(task["x_ref_w"]), float(task["P_w"])

@@ -146,7 +146,6 @@ def lowest(levels, rises):
     return np.min(np.concatenate(on_line))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "segments"), [(STEEP, 6), (BENT, 45), (SHELF, 45)], ids=["steep", "bent", "shelf"]
 )
@@ -170,7 +169,6 @@ def test_an_interval_ends_where_the_profile_does(task, segments, x64):
         np.testing.assert_allclose(at, 1.96, rtol=0.04, err_msg=name)
 
 
-@pytest.mark.slow
 def test_the_level_is_zero_at_the_half_power_frequency(x64):
     for task in (STEEP, BENT, SHELF, jm.on_rung(STEEP, 1)):
         at, below, above = level_at(task, frequency_of(task) * np.exp([0.0, -0.1, 0.1]))
@@ -179,7 +177,6 @@ def test_the_level_is_zero_at_the_half_power_frequency(x64):
         assert below > 0 > above
 
 
-@pytest.mark.slow
 def test_the_frequency_jumps_where_the_level_does_not(x64):
     """A third more of the passive damping: four times the frequency, and below it at most a third
     more power."""
@@ -189,7 +186,6 @@ def test_the_frequency_jumps_where_the_level_does_not(x64):
     assert np.max(np.abs(level_at(SHELF, grid) - level_at(BENT, grid))) < 0.3
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("task", [STEEP, BENT], ids=["steep", "bent"])
 def test_that_of_a_half_power_frequency_ends_where_its_profile_does(task, x64):
     """With the inverse curvature as covariance the root of the rise that is sought is 1.96, at
@@ -204,7 +200,6 @@ def test_that_of_a_half_power_frequency_ends_where_its_profile_does(task, x64):
     )
 
 
-@pytest.mark.slow
 def test_about_a_shelf_there_is_no_interval(x64):
     """The region reaches over the bins."""
     problem, objective, seen = fitted(SHELF, drawn(SHELF, 45, 3))
@@ -222,7 +217,6 @@ def test_about_a_shelf_there_is_no_interval(x64):
     )
 
 
-@pytest.mark.slow
 def test_stated_intervals_hold_the_truth(x64):
     """Dampings drawn from the prior about a bent response: misses at most as 5 % allow once in 10
     000 runs."""

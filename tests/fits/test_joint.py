@@ -166,7 +166,6 @@ def two_people():
     return {"one": simulated(TRUTH, "one", 5), "other": simulated(other, "other", 6)}
 
 
-@pytest.mark.slow
 def test_with_all_parameters_separate_it_is_the_single_fits():
     with without_intervals():
         joint = jm.fit_joint(two_people(), separate=DEFAULT_FREE, starts=16, seeds=0)
@@ -188,7 +187,6 @@ def test_with_all_parameters_separate_it_is_the_single_fits():
                 assert found.stderr == pytest.approx(estimate.stderr, rel=0.05), name
 
 
-@pytest.mark.slow
 def test_a_second_equal_target_narrows_errors_by_the_root_of_two():
     """Of another level, which the tasks do not know of: that is noticed."""
     target, other = (
@@ -260,7 +258,6 @@ def joint_problem(**options: Any):
     return planned(targets, {"force": ISOMETRIC, "shift": load}, **options).problem
 
 
-@pytest.mark.slow
 def test_the_joint_problem_is_its_parts(x64):
     problem = joint_problem(separate=("c_w",), coefficient_of_variation=False)
     assert problem.coordinates.names == (
@@ -294,7 +291,6 @@ def test_the_joint_problem_is_its_parts(x64):
     np.testing.assert_allclose(residuals, np.concatenate([*parts, theta[0]]))
 
 
-@pytest.mark.slow
 def test_slopes_of_the_joint_moments_are_those_of_differences(x64):
     objective = joint_problem(separate=("harmonic_frequency",)).linear()
     theta, step = np.full((1, 9), 0.1), 1e-5
@@ -321,7 +317,6 @@ def test_tasks_at_theta_have_the_shared_values(x64):
     np.testing.assert_allclose(problem.theta_of((force, shift)), theta, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_proportional_parameters_keep_the_ratio_of_their_tasks(x64):
     names = (
         "k_w",
@@ -402,7 +397,6 @@ def quick():
     )
 
 
-@pytest.mark.slow
 def test_a_result_holds_everything(quick):
     assert quick.success, quick.message
     assert quick.free == (
@@ -435,7 +429,6 @@ def test_a_result_holds_everything(quick):
     assert any(notice.startswith("fitted by the formula alone") for notice in quick.notices)
 
 
-@pytest.mark.slow
 def test_a_result_in_words(quick):
     text = str(quick)
     assert text.startswith("The model describes the data: chi2 per bin ")
@@ -449,7 +442,6 @@ def test_a_result_in_words(quick):
     assert max(map(len, text.splitlines())) <= 125
 
 
-@pytest.mark.slow
 def test_what_is_saved_is_read_back_equal(quick, tmp_path):
     path = tmp_path / "new" / "joint.json"
     quick.save(path)
@@ -476,7 +468,6 @@ def test_the_figure(quick):
         plt.close(figure)
 
 
-@pytest.mark.slow
 def test_a_fit_that_fails_is_a_result(tmp_path):
     """Noise on C does nothing at rest: no spectrum is finite."""
     still = dict.fromkeys(("noise_K_w", "noise_K_z", "harmonic_amplitude"), 0.0) | {
@@ -585,7 +576,6 @@ def test_bad_arguments(targets, options, message):
         jm.fit_joint(targets, **options)
 
 
-@pytest.mark.slow
 def test_priors_and_bounds_by_joint_or_plain_name(x64):
     plan = planned(
         {"a": A, "b": B},
@@ -635,7 +625,6 @@ def test_two_targets_climb_together_and_their_aic_is_that_of_both(x64):
         jm.fit_joint(pair, rungs=2, tasks={name: jm.Isometric() for name in pair})
 
 
-@pytest.mark.slow
 def test_tasks_of_another_mean_force_are_noticed():
     """With tasks the mean is no datum: their newtons are those of another muscle."""
     stated = expected(TRUTH, mean=[60.0, 61.0], unit="N", segments=[12, 12])

@@ -49,7 +49,6 @@ def fitted(tmp_path_factory):
     return folder / "out", found.output
 
 
-@pytest.mark.slow
 def test_a_response_alone_knows_no_noise_that_would_limit_a_further_measurement(fitted):
     result = jm.load_result(fitted[0] / "fit.json")
     report = jm.identifiability(result)
@@ -63,7 +62,6 @@ def test_a_response_alone_knows_no_noise_that_would_limit_a_further_measurement(
         jm.design_input(result)
 
 
-@pytest.mark.slow
 def test_a_tangent_stiffness_far_from_the_lowest_measured_one_is_called_extrapolated(fitted):
     result = jm.load_result(fitted[0] / "fit.json")
     part, known = result.only, result.only.target.stiffness.known
@@ -87,7 +85,6 @@ def read(path):
     return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
 
 
-@pytest.mark.slow
 def test_a_response_alone_is_fitted_from_the_command_line(fitted):
     folder, said = fitted
     assert {path.name for path in folder.iterdir()} == {
@@ -124,7 +121,6 @@ def test_a_response_alone_is_fitted_from_the_command_line(fitted):
     assert f"dynamic stiffness  {F.size} points" in str(result.targets["figure"])
 
 
-@pytest.mark.slow
 def test_its_figure_shows_gain_phase_and_residuals(fitted):
     result, given = jm.load_result(fitted[0] / "fit.json"), response()
     figure = result.plot()
@@ -151,7 +147,6 @@ def test_its_figure_shows_gain_phase_and_residuals(fitted):
     plt.close(figure)
 
 
-@pytest.mark.slow
 def test_goodness_of_a_response_has_the_law_of_least_squares():
     """Three numbers that it determines are free: what a replicate's fit leaves is chi² of so many
     degrees fewer."""
@@ -176,7 +171,6 @@ def test_goodness_of_a_response_has_the_law_of_least_squares():
     )
 
 
-@pytest.mark.slow
 def test_goodness_finds_the_point_that_is_off():
     true = response()
     value = true.value.copy()
@@ -396,7 +390,6 @@ def test_a_hold_is_not_taken_for_a_moved_record(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
 def test_the_answer_of_a_light_and_damped_muscle_is_taken_off_whole(monkeypatch):
     """A muscle of 55 N and half a kilogram relaxes at 3100 /s: too fast for whole steps, at which
     no answer was finite."""
@@ -534,7 +527,6 @@ def test_what_is_taken_off_is_as_nonlinear_as_the_recording(share):
         assert abs(found - 100 * share) < 4 * error + 1 and error < 10
 
 
-@pytest.mark.slow
 def test_fluctuations_of_another_origin_do_not_hide_the_answer_from_the_search():
     """They fall off at 1 Hz, the muscle relaxes at 5 Hz: a search that begins with both at once
     ends in a wrong muscle."""

@@ -33,7 +33,6 @@ def result():
     return jm.fit(TASK, TARGET, **ALONE)
 
 
-@pytest.mark.slow
 def test_coordinates_and_parameters(problem):
     start = problem.parameters(problem.start)
     assert tuple(start) == problem.names == jm.fits.Problem.of(problem.fit_problem).names
@@ -57,7 +56,6 @@ def test_coordinates_and_parameters(problem):
     )
 
 
-@pytest.mark.slow
 def test_values_are_traced_on_their_way_to_theta_and_exact_beside_a_bound():
     """A log density of parameters in their units, as `problem.theta` under `jit` and `grad` makes
     it."""
@@ -81,7 +79,6 @@ def test_values_are_traced_on_their_way_to_theta_and_exact_beside_a_bound():
     assert np.isfinite(back(start | {"harmonic_frequency": 9.5})["k_w"])
 
 
-@pytest.mark.slow
 def test_the_prior_is_a_density_of_the_coordinates(problem):
     """`ln N(z) + ln |dz/dθ|` with z the distance from the prior's centre in its standard
     deviations, from the parameters."""
@@ -102,7 +99,6 @@ def test_the_prior_is_a_density_of_the_coordinates(problem):
     assert difference == pytest.approx(density(theta) - density(problem.start), abs=1e-9)
 
 
-@pytest.mark.slow
 def test_log_density_and_its_slope(problem):
     """The likelihood is that of `log_likelihood` but for a constant; both halves are
     differentiable."""
@@ -130,7 +126,6 @@ def test_log_density_and_its_slope(problem):
     np.testing.assert_allclose(slope, (ahead - behind) / 2e-5, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.slow
 def test_the_log_density_has_second_derivatives():
     """Against differences of the slope, in a step so small that the ripple along the frequency does
     not show."""
@@ -153,7 +148,6 @@ def test_the_log_density_has_second_derivatives():
     np.testing.assert_allclose(found, found.T, rtol=1e-8)
 
 
-@pytest.mark.slow
 def test_far_away_the_density_is_zero_and_not_a_number_for_a_sampler_to_choke_on(problem):
     far = np.full(len(problem.names), 15.0)
     assert float(problem.log_density(far)) == -np.inf
@@ -182,7 +176,6 @@ def test_bounds_are_counted_in_standard_deviations_of_the_prior():
     np.testing.assert_allclose(found.high, [np.log(4.0) / 0.5, 0.1], rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_the_log_likelihood_is_that_of_the_task_but_for_the_variation():
     """A coefficient of variation scatters as at the start; without one the two are the same."""
     target = jm.Target("a", TARGET.proportional_power, segments=12)
@@ -194,7 +187,6 @@ def test_the_log_likelihood_is_that_of_the_task_but_for_the_variation():
     np.testing.assert_allclose(off, off[0], atol=1e-8)
 
 
-@pytest.mark.slow
 def test_scipy_finds_the_minimum_of_the_fit(problem, result):
     """In the two descents that a fit makes: what the harmonic holds of the bins is unknown first,
     then known.
@@ -217,7 +209,6 @@ def test_scipy_finds_the_minimum_of_the_fit(problem, result):
         assert found.success and found.cost == pytest.approx(ours, rel=1e-3)
 
 
-@pytest.mark.slow
 def test_another_optimiser_finds_the_same(result):
     other = jm.fit(TASK, TARGET, **ALONE, optimiser=optx.Dogleg(rtol=1e-9, atol=1e-9))
     assert (
@@ -244,7 +235,6 @@ def test_a_target_without_scatter_has_residuals_but_no_density():
         bare.log_density(bare.start)
 
 
-@pytest.mark.slow
 def test_results_summarise_themselves(result):
     summary = result.summary()
     assert str(summary) == repr(summary) == str(result) == repr(result)

@@ -109,7 +109,6 @@ def result(minute):
     return jm.fit(jm.PrescribedLength(), minute)
 
 
-@pytest.mark.slow
 def test_stiffness_and_damping_are_known(result):
     """The issue's bounds: within three stated errors, which are at most 15, 3, 8 and 8 %."""
     assert result.success and result.adequate
@@ -126,7 +125,6 @@ def test_stiffness_and_damping_are_known(result):
     assert result.settings["prior_centre"]["m_w"] == TRUE["m_w"]  # not carried with the mean force
 
 
-@pytest.mark.slow
 def test_tangents_do_not_hang_on_the_reference_displacement(minute, result, x64):
     """With 30 mm instead of 20 the same data give another K_w0, foretold in the text, and the same
     slopes at the hold."""
@@ -159,7 +157,6 @@ def test_tangents_do_not_hang_on_the_reference_displacement(minute, result, x64)
         assert abs(other[name].value - result[name].value) < result[name].stderr, name
 
 
-@pytest.mark.slow
 def test_what_a_fit_says_and_keeps(result, tmp_path):
     text = str(result)
     assert "The model describes the data: chi2 per datum" in text and "PrescribedLength" in text
@@ -237,7 +234,6 @@ def test_the_posterior_is_as_wide_as_stated(result, monkeypatch):
         assert abs(np.mean(draws) - true) < 4 * result[name].stderr, name
 
 
-@pytest.mark.slow
 def test_a_bad_spectrum_does_not_hide_behind_a_good_response(result, x64):
     """The residuals of the fit, those of the spectrum made larger and those of the response
     smaller."""
@@ -279,7 +275,6 @@ def test_a_bad_spectrum_does_not_hide_behind_a_good_response(result, x64):
     assert neither.judged[1] == ()
 
 
-@pytest.mark.slow
 def test_the_fitted_muscle_sees_what_it_was_fitted_to(minute, result):
     """The response that was taken off is that of the muscle found: seen with it the numbers are the
     same."""
@@ -289,7 +284,6 @@ def test_the_fitted_muscle_sees_what_it_was_fitted_to(minute, result):
     assert np.max(np.abs(off)) < 0.2
 
 
-@pytest.mark.slow
 def test_the_estimate_of_the_stiffness_is_not_biased(minute):
     """Seen with the true muscle, whatever window, the points scatter about the truth by what they
     state."""
@@ -411,7 +405,6 @@ def published():
     )
 
 
-@pytest.mark.slow
 def test_a_published_response_alone(published):
     result = jm.fit(jm.PrescribedLength().replace(P_w=5.0), published)
     assert result.success and result.adequate and result.chi2_per_bin is None
@@ -427,7 +420,6 @@ def test_a_published_response_alone(published):
     assert result["K_z0"].stderr < 0.05 * WHOLE["K_z0"]
 
 
-@pytest.mark.slow
 def test_a_published_response_with_a_spectrum_of_the_same_muscle(published):
     still = jm.Isometric(harmonic=jm.Harmonic(amplitude=0.0)).replace(
         **TRUE, noise_K_w=NOISE["K_w"], noise_K_z=NOISE["K_z"]
@@ -447,7 +439,6 @@ def test_a_published_response_with_a_spectrum_of_the_same_muscle(published):
         assert result[name].stderr < 1.02 * alone[name].stderr
 
 
-@pytest.mark.slow
 def test_likelihood_of_a_stiffness(published):
     """Its Gaussian law, written again; and the gradient, forward, reverse and by differences."""
     target = jm.Target("published", None, stiffness=published)
@@ -551,7 +542,6 @@ def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
         assert abs(fit[name].value - value) < 4 * fit[name].stderr, name
 
 
-@pytest.mark.slow
 def test_a_line_in_the_fluctuations_is_fitted_though_noise_alone_passes():
     """Left out, it would move C_w0 and K_z0 by about one stated error. (Without one none is fitted:
     `minute`.)"""
@@ -579,7 +569,6 @@ def test_a_harmonic_that_is_asked_for_is_not_left_out():
         assert without_rhythm(task, FitOptions(**asked)) is task
 
 
-@pytest.mark.slow
 def test_without_scatter_there_is_no_verdict(minute):
     seen = minute.target()
     silent = jm.Target(

@@ -510,7 +510,6 @@ ENVELOPES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("envelope", ENVELOPES)
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("kind", TASKS)

@@ -110,7 +110,6 @@ def test_frequency_and_width_of_what_has_no_amplitude_are_not_free(x64):
 # --- the climb
 
 
-@pytest.mark.slow
 def test_the_base_model_is_kept_where_it_describes_the_data():
     result = jm.fit(TASK, drawn(expected(TASK), 30, 3), **QUICK)
     (only,) = result.ladder
@@ -127,7 +126,6 @@ def test_more_starts_count_for_every_model(asked, found):
     assert _fewer(asked) == found
 
 
-@pytest.mark.slow
 def test_a_tremor_is_climbed_to_and_found():
     result = climbed()
     chosen = next(rung for rung in result.ladder if rung.chosen)
@@ -145,7 +143,6 @@ def test_a_tremor_is_climbed_to_and_found():
     )
 
 
-@pytest.mark.slow
 def test_the_progress_says_which_model_it_is_at_and_never_falls_back():
     _, told = climbed_and_told()
     shares = [share for _, share in told]
@@ -157,7 +154,6 @@ def test_the_progress_says_which_model_it_is_at_and_never_falls_back():
     assert max(share for text, share in told if text.startswith("model 2")) <= 3 / 4 * 0.6
 
 
-@pytest.mark.slow
 def test_a_significant_line_is_tried_against_the_tremor():
     """A short recording of a tremor: the base model describes it, with a line. Rung 1 has it, too,
     so rung 2 is tried."""
@@ -168,7 +164,6 @@ def test_a_significant_line_is_tried_against_the_tremor():
     assert first.chosen == (tremor.aic > first.aic - 2)
 
 
-@pytest.mark.slow
 def test_a_chosen_model_or_noise_is_not_climbed_from():
     target = drawn(expected(with_tremor()), 90, 1)
     for asked in (
@@ -180,7 +175,6 @@ def test_a_chosen_model_or_noise_is_not_climbed_from():
             assert jm.fit(TASK, target, **asked, **QUICK | {"starts": 2}).ladder == ()
 
 
-@pytest.mark.slow
 def test_the_criterion_is_akaikes(x64):
     """-2 ln L with scipy's gamma laws joined by their normal scores, and the trace of the hat
     matrix by differences."""
@@ -259,7 +253,6 @@ def test_no_remedy_names_what_the_fit_does_not_have():
     assert "What to do: hold activation_time" in told
 
 
-@pytest.mark.slow
 def test_a_slow_twitch_is_told_by_the_fit():
     """A twitch of 0.25 s and ten times as many segments as above, so that the interval excludes
     that of human muscle."""
@@ -273,7 +266,6 @@ def test_a_slow_twitch_is_told_by_the_fit():
 # --- what it gives
 
 
-@pytest.mark.slow
 def test_components_add_up_and_are_what_their_noise_alone_gives(x64):
     result = climbed()
     parts = result.only.components
@@ -294,7 +286,6 @@ def test_components_add_up_and_are_what_their_noise_alone_gives(x64):
     np.testing.assert_allclose(parts["tremor"], own / whole, rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_half_power_frequency_against_a_root_of_the_transfer_function(x64):
     result = climbed()
     task = result.task
@@ -322,7 +313,6 @@ def test_a_band_that_is_hardly_covered_is_left_out():
     assert "band_8_12" in derived_names(longer)
 
 
-@pytest.mark.slow
 def test_bands_are_integrals_over_bins():
     """A bin's power is spread evenly over its width: up to a frequency there is the linearly
     interpolated sum."""
@@ -343,7 +333,6 @@ def test_bands_are_integrals_over_bins():
     assert f"% ({100 * measured:.2g} %), 0.5-1 Hz" in said and "band_" not in said
 
 
-@pytest.mark.slow
 def test_all_that_follows_a_fit_takes_a_model_with_tremor(tmp_path):
     result = climbed()
     result.save(tmp_path / "fit.json")

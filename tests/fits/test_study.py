@@ -117,7 +117,6 @@ def test_the_interaction_is_the_difference_of_changes():
     assert (d.a, d.b, d.where) == ("young", "old", "tired - rest")
 
 
-@pytest.mark.slow
 def test_what_a_fit_does_not_determine_is_left_out_and_counted():
     study = made_study(left_out=("old1, tired",))
     groups = {d.where: d for d in of(study, "groups")}
@@ -148,7 +147,6 @@ def test_corrections(correction, expected):
     assert corrected([], correction) == []
 
 
-@pytest.mark.slow
 def test_every_kind_of_comparison_is_corrected_by_itself():
     study = made_study(quantities=None)  # the derived ones; the parameter c_w is not among them
     assert study.quantities == ("corner_frequency", "tremor_frequency")
@@ -191,7 +189,6 @@ def test_a_quantity_is_asked_for_by_either_name():
     ]
 
 
-@pytest.mark.slow
 def test_the_folder(tmp_path):
     study = made_study()
     (tmp_path / "mine.txt").write_text("kept")
@@ -231,7 +228,6 @@ def test_the_folder(tmp_path):
         assert said in methods, said
 
 
-@pytest.mark.slow
 def test_a_study_without_differences_leaves_none_of_an_earlier_one(tmp_path):
     made_study().save(tmp_path)
     (tmp_path / "mine.csv").write_text("kept")
@@ -244,7 +240,6 @@ def test_a_study_without_differences_leaves_none_of_an_earlier_one(tmp_path):
     }
 
 
-@pytest.mark.slow
 def test_an_interrupted_save_leaves_an_earlier_study_as_it_was(tmp_path, monkeypatch):
     made_study(correction="fdr").save(tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}

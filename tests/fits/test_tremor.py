@@ -45,7 +45,6 @@ def test_the_tremor_is_recovered():
     assert found.check["largest_deviation"] < 0.05  # linear response and simulation agree
 
 
-@pytest.mark.slow
 def test_its_file_is_the_same_result(tmp_path):
     result().save(tmp_path / "fit.json")
     again = jm.load_result(tmp_path / "fit.json")
@@ -68,7 +67,6 @@ def test_an_acceleration_and_a_displacement_that_look_alike_are_no_batch(x64):
     ]
 
 
-@pytest.mark.slow
 def test_the_likelihood_is_highest_near_the_tremor(x64):
     low, here, high = (
         float(jm.log_likelihood(TRUTH.replace(resonance_frequency=f), target()))

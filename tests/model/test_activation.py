@@ -68,7 +68,6 @@ def test_gain_and_phase_of_a_sine(x64, frequency):
     assert np.arctan2(ahead, in_phase) == pytest.approx(-2 * np.arctan(omega_t), abs=1e-6)
 
 
-@pytest.mark.slow
 def test_white_noise_comes_out_with_its_variance(x64):
     """∫ h² dt / rate = 1 / (4 T rate); held over a step, less by (dt / T)² / 12 times ∫ h'² T² / ∫
     h², which is 1."""

@@ -170,7 +170,6 @@ def test_isometric_is_the_same_muscle_with_its_insertion_held(x64):
         np.testing.assert_allclose(force, MUSCLE["m_z"] * pulled, rtol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("argument", ["literal", "elongation"])
 @pytest.mark.parametrize("c_z, v_ref_z", [(5.0, 1.0), (500.0, 0.1)])
 def test_contraction_velocity_inverts_passive_force(x64, argument, c_z, v_ref_z):
@@ -189,7 +188,6 @@ def test_contraction_velocity_inverts_passive_force(x64, argument, c_z, v_ref_z)
     np.testing.assert_allclose(at_once(jax.vmap(passed), y, force, u), force, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_a_custom_law_is_a_parameter_in_replace_and_simulate(x64):
     muscle = jm.Muscle(stiffness_z=Tendon())
     task = jm.PrescribedForce(2.0, 1.0, muscle=muscle)
@@ -240,7 +238,6 @@ class Linear(jm.AbstractMuscle):
         return v_z - (force - (self.stiff + u[1]) * (x_z - x_w)) / (10.0 + u[3])
 
 
-@pytest.mark.slow
 def test_a_whole_own_muscle_runs_in_every_task():
     for kind in TASKS:
         task = kind(muscle=Linear()).replace(stiff=120.0)

@@ -73,7 +73,6 @@ def test_psd_scales_with_the_square_of_the_amplitude():
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "noise", [WHITE, BAND, OU], ids=["white", "band-limited", "ornstein-uhlenbeck"]
 )
@@ -121,7 +120,6 @@ def covariances(x, lags):
     return np.stack([(x[:, : n - k] * x[:, k:]).mean(axis=(1, 2)) for k in lags], axis=1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("dt", [8e-3, 2e-3])
 @pytest.mark.parametrize("noise", [BAND, OU], ids=["band-limited", "ornstein-uhlenbeck"])
 def test_the_autocovariance_is_exact_at_any_step(x64, noise, dt):
@@ -140,7 +138,6 @@ def test_the_autocovariance_is_exact_at_any_step(x64, noise, dt):
     assert np.abs(standard).max() < 4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("noise", [BAND, OU], ids=["band-limited", "ornstein-uhlenbeck"])
 def test_the_transition_is_the_exact_one(x64, noise):
     """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form
@@ -174,7 +171,6 @@ def test_band_limited_transition_is_the_matrix_exponential(x64):
     np.testing.assert_allclose(end, scipy.linalg.expm(drift * dt) @ start, rtol=1e-10)
 
 
-@pytest.mark.slow
 def test_slopes_are_the_derivative_of_values(x64):
     omega = 2 * np.pi * BAND.cutoff
     for dt in (2e-3, 5e-4):
@@ -190,7 +186,6 @@ def test_slopes_are_the_derivative_of_values(x64):
         )
 
 
-@pytest.mark.slow
 def test_white_increments_have_the_variance_of_their_step(x64):
     for dt in (1e-3, 2.5e-4):
         increments = np.asarray(unit_paths(WHITE, dt, 1000, seeds=64).increments)
@@ -200,14 +195,12 @@ def test_white_increments_have_the_variance_of_their_step(x64):
         assert abs(neighbours) < 3.3 / np.sqrt(increments.size)
 
 
-@pytest.mark.slow
 def test_paths_are_stationary_from_the_start(x64):
     for noise, variance in ((BAND, band_variance(BAND)), (OU, 1.0)):
         first = np.asarray(unit_paths(noise, 2e-3, 1, seeds=4096).values)[:, 0] / np.sqrt(variance)
         assert abs(np.mean(first**2) - 1) < 3.3 * np.sqrt(2 / first.size)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", [jm.WhiteNoise, jm.BandLimitedNoise, jm.OrnsteinUhlenbeckNoise])
 def test_channels_are_independent_unless_shared(x64, kind):
     def path(noise):
@@ -224,7 +217,6 @@ def test_channels_are_independent_unless_shared(x64, kind):
     assert path(kind(1.0, shared=True)).shape[-1] == 1
 
 
-@pytest.mark.slow
 def test_a_shared_noise_moves_all_coefficients_together(x64):
     def force(shared, channel):
         noise = jm.BandLimitedNoise({channel: 0.1}, shared=shared)
@@ -259,7 +251,6 @@ def test_amplitude_as_number_tuple_and_mapping(x64):
             np.testing.assert_allclose(absolute.noise_scale(), amplitude, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_relative_noise_is_absolute_noise_of_that_size(x64):
     def force(noise):
         return jm.simulate(jm.Isometric(noise=noise), KEY, duration=1.0).output
@@ -304,7 +295,6 @@ def test_impossible_rates_and_grids_are_refused():
         )
 
 
-@pytest.mark.slow
 def test_single_precision_paths_follow_double_ones():
     for kind, attributes in (
         (jm.BandLimitedNoise, ("values", "slopes")),
@@ -455,7 +445,6 @@ def test_what_is_asked_of_a_noise_of_ones_own_holds_of_ours(noise, monkeypatch):
     assert type(noise) in _own_parts._SEEN
 
 
-@pytest.mark.slow
 def test_a_noise_of_ones_own_is_simulated_as_its_response_says():
     """16 seeds with the control variate: the standard error is a few tenths of a per cent, what the
     response misses less."""

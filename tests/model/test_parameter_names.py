@@ -177,7 +177,6 @@ def test_a_parameter_is_one_number(several):
         jm.Isometric().replace(k_w=several)
 
 
-@pytest.mark.slow
 def test_spectra_sweeps_and_sensitivities_say_what_they_are():
     """As text where they are printed; taken apart, or while JAX traces them, as their trees."""
     spectrum = jm.expected_spectrum(jm.Isometric())

@@ -58,7 +58,6 @@ def test_precision_is_the_callers():
         assert {value.dtype.name for value in values.values()} == {"float64"}
 
 
-@pytest.mark.slow
 def test_slopes_by_name_against_differences_and_against_replace(x64):
     values, rebuild, slopes = by_name()
     assert set(slopes) == set(NAMES)
@@ -74,7 +73,6 @@ def test_slopes_by_name_against_differences_and_against_replace(x64):
         np.testing.assert_allclose(slopes[name], (ahead - behind) / (2 * h), rtol=SLOPE)
 
 
-@pytest.mark.slow
 def test_what_filter_grad_says_of_numbers_and_of_arrays(x64):
     """The reason for `partition`: None for a Python number, and the slope where all numbers have
     become arrays."""
@@ -90,7 +88,6 @@ def test_what_filter_grad_says_of_numbers_and_of_arrays(x64):
     )
 
 
-@pytest.mark.slow
 def test_a_gradient_step_by_an_optimiser_of_pytrees(x64):
     """`optax` moves such dictionaries: ten steps of plain descent in the logarithm lower the loss
     at every step."""
@@ -114,7 +111,6 @@ def test_a_gradient_step_by_an_optimiser_of_pytrees(x64):
     assert np.all(np.diff(costs) < 0) and costs[-1] < 0.5 * costs[0]
 
 
-@pytest.mark.slow
 def test_a_rebuilt_task_is_simulated_and_saved(x64, tmp_path):
     values, rebuild = jm.model.partition(TASK, NAMES)
     again = rebuild(values)

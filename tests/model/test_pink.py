@@ -95,7 +95,6 @@ def test_the_density_is_the_transform_of_the_autocovariance(x64):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("dt", [5e-3, 2.5e-3])
 def test_the_transition_is_the_exact_one(x64, dt):
     """The map from normals to the path, taken as a matrix: its Gram matrix is the autocovariance at
@@ -114,7 +113,6 @@ def test_the_transition_is_the_exact_one(x64, dt):
 
 
 @pytest.mark.parametrize("dt", [8e-3, 4e-3])
-@pytest.mark.slow
 def test_drawn_paths_have_the_autocovariance(x64, dt):
     """Variance and autocovariance of the drawn paths at dt and dt / 2, from the start."""
     x = unit_paths(PINK, dt, round(4.0 / dt), seeds=512)
@@ -129,7 +127,6 @@ def test_drawn_paths_have_the_autocovariance(x64, dt):
     assert abs(np.mean(x[:, 0] ** 2) - 1) < 3.3 * np.sqrt(2 / x[:, 0].size)
 
 
-@pytest.mark.slow
 def test_paths_have_the_density(x64):
     """Periodograms of drawn paths; a tapered segment's expected power is a quadratic form of the
     autocovariance."""
@@ -152,7 +149,6 @@ def test_paths_have_the_density(x64):
     assert np.ptp(seen) < 2 * PINK.deviation() + 3.3 * np.sqrt(2) * np.max(error / expected) + 0.05
 
 
-@pytest.mark.slow
 def test_channels_are_independent_unless_shared(x64):
     x = unit_paths(PINK, 2e-3, 400, seeds=128)
     products = np.stack([(x[..., i] * x[..., j]).mean(axis=1) for i in range(4) for j in range(i)])
@@ -195,7 +191,6 @@ TASKS = {
 @pytest.mark.parametrize(
     "name", ["isometric", *(pytest.param(n, marks=pytest.mark.slow) for n in list(TASKS)[1:])]
 )
-@pytest.mark.slow
 def test_its_response_is_the_sum_of_its_states_responses(x64, name):
     """Each is an Ornstein-Uhlenbeck noise of variance w_i and correlation time 1 / 2π f_i, with a
     known response."""
@@ -210,7 +205,6 @@ def test_its_response_is_the_sum_of_its_states_responses(x64, name):
     np.testing.assert_allclose(linear_spectrum(task, task.settings).power, total, rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_simulations_have_the_expected_spectrum(x64):
     """Stiffness noise of 1 %: nonlinearity adds 1e-4 of a bin, a seed scatters by more than half of
     one."""
@@ -225,7 +219,6 @@ def test_simulations_have_the_expected_spectrum(x64):
     references.assert_standard_normal(z, every=3)
 
 
-@pytest.mark.slow
 def test_linear_trajectories_have_the_expected_spectrum_on_the_grid_of_a_fit(x64):
     runs = jm.ensemble(jm.Isometric(noise=jm.PinkNoise()), KEY, seeds=128, dt=2.5e-3)
     power = np.asarray(runs.beside().spectrum().power)
@@ -270,7 +263,6 @@ def condition(A, F):
     return np.linalg.cond(np.kron(A, np.eye(len(F))) + np.kron(np.eye(len(A)), F))
 
 
-@pytest.mark.slow
 def test_single_precision():
     normals, noise = np.random.default_rng(0).normal(size=(501, 16)), jm.PinkNoise(1.0)
     task = jm.Isometric(5.0, 0.003, noise=jm.PinkNoise())

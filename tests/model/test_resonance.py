@@ -42,7 +42,6 @@ def equation(frequency, width):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_density_and_filter_are_those_of_the_equation(x64, case):
     frequency, width = CASES[case]
@@ -78,7 +77,6 @@ def test_density_and_filter_are_those_of_the_equation(x64, case):
         np.testing.assert_allclose(noise.density(x), transform, rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("case", CASES)
 def test_a_step_is_the_exact_one(case, precision):
@@ -115,7 +113,6 @@ def test_a_step_is_the_exact_one(case, precision):
         )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_path_is_exact_on_the_grid(x64, case):
     """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form
@@ -137,7 +134,6 @@ def test_the_path_is_exact_on_the_grid(x64, case):
         )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("case", CASES)
 def test_paths_have_variance_covariances_and_spectrum(case, precision):
@@ -179,7 +175,6 @@ def test_paths_have_variance_covariances_and_spectrum(case, precision):
     )
 
 
-@pytest.mark.slow
 def test_a_sum_is_its_parts(x64):
     band, tremor = jm.BandLimitedNoise({"K_w": 0.2}), jm.ResonantNoise(0.03)
     both, f = band + tremor, np.array([1.0, 9.0])
@@ -209,7 +204,6 @@ def test_a_sum_is_its_parts(x64):
 FAST = jm.ResonantNoise(0.1, 90.0, 20.0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "make, message",
     [

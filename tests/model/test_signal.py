@@ -32,7 +32,6 @@ def jumps(signal, joints, highest, h=1e-9):
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.slow
 def test_as_many_derivatives_are_continuous_as_claimed_and_no_more(x64, name):
     signal, smooth, joints = CASES[name]
     assert smooth == min(signal.smoothness, 6)
@@ -60,7 +59,6 @@ def test_the_slope_is_not_lost_at_a_joint(signal, precision):
         np.testing.assert_allclose(here, 0.5 * (before + after), atol=1e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_derivatives_are_those_of_finite_differences(x64, name):
     signal, smooth, _ = CASES[name]
@@ -87,7 +85,6 @@ def test_a_step_is_the_incomplete_beta_function(x64):
     np.testing.assert_allclose(signal(t), references.smooth_step(t, 2.5), atol=1e-12)
 
 
-@pytest.mark.slow
 def test_the_usual_step_rises_from_half_a_second_on_within_one():
     """As design.md, section 2 has it."""
     found = np.asarray(jax.vmap(SmoothStep())(jnp.array([0.0, 0.5, 1.0, 1.5, 15.0])))
@@ -127,7 +124,6 @@ def test_decay_is_its_formula(x64):
     )
 
 
-@pytest.mark.slow
 def test_samples_give_scipys_spline(x64):
     rng = np.random.default_rng(0)
     times = np.cumsum(rng.uniform(0.05, 0.2, 30))
@@ -201,7 +197,6 @@ def test_impossible_signals_are_refused(user_view):
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("name", ["step", "ramp", "sampled"])
-@pytest.mark.slow
 def test_a_table_gives_its_signal_and_two_derivatives_at_every_grid_point(name, precision):
     with jax.enable_x64(precision == "float64"):
         signal, interval = CASES[name][0], 2.5e-4

@@ -75,7 +75,6 @@ def grid_of_words():
     return np.unique(np.concatenate([ends, spread]))
 
 
-@pytest.mark.slow
 def test_the_normal_of_a_word_is_the_inverse_of_the_distribution():
     halves = grid_of_words()
     tail = (halves + 0.5) * 2.0**-31
@@ -95,7 +94,6 @@ def test_the_normal_of_a_word_is_the_inverse_of_the_distribution():
     )
 
 
-@pytest.mark.slow
 def test_normals_are_normal(normals):
     z = normals.ravel()
     assert scipy.stats.kstest(z, "norm").pvalue > P_LEAST
@@ -128,7 +126,6 @@ def together(pairs):
     return np.concatenate([np.ravel(each) for each in found])
 
 
-@pytest.mark.slow
 def test_neighbouring_seeds_are_independent(normals):
     flat = normals.reshape(SEEDS, -1)
     references.assert_standard_normal(
@@ -148,7 +145,6 @@ def test_channels_are_independent(normals):
     references.assert_standard_normal(together(pairs))
 
 
-@pytest.mark.slow
 def test_parts_of_a_sum_and_the_start_are_independent(normals):
     later = normals_of(first=APART, count=1)[..., 0]
     references.assert_standard_normal(
@@ -169,7 +165,6 @@ def test_different_keys_make_different_noise(normals):
     )
 
 
-@pytest.mark.slow
 def test_every_bit_is_balanced_and_no_two_go_together(words):
     bits = 2.0 * ((words.ravel()[:, None] >> np.arange(32, dtype=np.uint32)) & 1) - 1
     references.assert_standard_normal(bits.sum(axis=0) / np.sqrt(len(bits)))
@@ -240,7 +235,6 @@ def test_words_are_those_of_the_formula(key):
         np.testing.assert_array_equal(found, exact)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("generator", ["hash", "threefry"])
 @pytest.mark.parametrize("increments", ["gaussian", "weak"])
 def test_a_number_depends_on_seed_step_and_place_alone(generator, increments):
@@ -277,7 +271,6 @@ def test_a_number_depends_on_seed_step_and_place_alone(generator, increments):
             )
 
 
-@pytest.mark.slow
 def test_both_precisions_have_the_same_numbers():
     for increments in ("gaussian", "weak"):
 
@@ -293,7 +286,6 @@ def test_both_precisions_have_the_same_numbers():
         np.testing.assert_array_equal(made[0].astype(float), made[1])
 
 
-@pytest.mark.slow
 def test_threefry_makes_other_numbers_of_the_same_law(normals):
     other = normals_of(512, seeds=64, draws=Draws.of("threefry", "gaussian"))
     assert scipy.stats.kstest(other.ravel(), "norm").pvalue > P_LEAST
@@ -336,7 +328,6 @@ def assert_drawn_on_the_way(noise, active):
     assert largest(drawn[0], given[0]) < tolerance and largest(drawn[1], given[1]) < tolerance
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", NOISES)
 def test_what_is_drawn_on_the_way_is_the_path_that_draw_and_realise_give(x64, name):
     assert_drawn_on_the_way(*NOISES[name])
@@ -348,7 +339,6 @@ def test_what_is_drawn_on_the_way_is_the_path_in_single_precision_too(name):
     assert_drawn_on_the_way(*NOISES[name])
 
 
-@pytest.mark.slow
 def test_simulate_draws_from_the_key_folded_with_the_seed(x64):
     found = jm.simulate(jm.PrescribedForce(noise=BAND), KEY, seed=4, substeps=1)
 

@@ -129,7 +129,6 @@ def test_what_is_observed_is_saved(tmp_path):
         jm.load_preset(tmp_path / "wrong.toml")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "moved",
     [
@@ -162,7 +161,6 @@ def test_motion_needs_smooth_inputs():
     jm.PrescribedMotion(RampHold(0.01), Decay(5.0))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("t", [0.2, 0.8, 1.2, 5.0])
 def test_the_output_of_motion_is_equation_1a(x64, t):
     """P_w = m_w x_w'' + C_w x_w' + K_w x_w + m_z x_z'' + F_ext, x_w'' by differences of a NumPy
@@ -239,7 +237,6 @@ STATIC = [
 
 
 @pytest.mark.parametrize("task, static", STATIC)
-@pytest.mark.slow
 def test_without_noise_everything_settles_at_the_roots_of_the_statics(x64, task, static):
     task = references.quiet(task, harmonic_amplitude=0.0, k_w=4e5, k_z=6e5, x_ref_z=0.015)
     states, output = static({name: float(value) for name, value in task.parameters.items()})
@@ -250,7 +247,6 @@ def test_without_noise_everything_settles_at_the_roots_of_the_statics(x64, task,
     np.testing.assert_allclose(jm.response.equilibrium(task), states, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_without_external_force_both_tissues_move_together(x64):
     task = references.quiet(jm.PrescribedForce(5.0), harmonic_amplitude=0.0)
     # k (x_ref² + x²) x = P
@@ -282,7 +278,6 @@ def test_eigenvalues_at_rest_are_those_of_the_linear_chain(x64):
     )
 
 
-@pytest.mark.slow
 def test_displacement_at_constant_force_oscillates_about_the_equilibrium(x64):
     task = jm.PrescribedForce(5.0, noise=jm.BandLimitedNoise(0.0016), harmonic=jm.Harmonic(4e-4))
     runs = jm.ensemble(task, KEY, seeds=64)
@@ -340,7 +335,6 @@ for expression in json.load(sys.stdin):
 """
 
 
-@pytest.mark.slow
 def test_what_cannot_be_a_part_of_a_task_or_its_call_is_named():
     """In a process without the type checks of the tests, which would come first."""
     ran = subprocess.run(

@@ -47,7 +47,6 @@ def white_powers(count=20_000):
     return scipy.signal.welch(rng.normal(size=(count, samples)), 100.0, nperseg=256)[1][:, 1:31]
 
 
-@pytest.mark.slow
 def test_law_of_welch_bins_is_that_of_scipys_spectra_of_white_noise():
     settings = jm.SpectrumSettings()
     law = welch_law(settings, np.arange(1, 31), (SEGMENTS,))
@@ -70,7 +69,6 @@ def test_trials_add_their_degrees_of_freedom():
     np.testing.assert_allclose(two.correlation, one.correlation, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_mean_of_seeds_without_control_scatters_as_that_of_so_many_spectra():
     """Over the ten seconds that a fit simulates there is room for `SEGMENTS`. With a control
     variate nothing scatters."""
@@ -102,7 +100,6 @@ def independent(bins):
     return bins._replace(precision=np.eye(30), logdet=np.zeros(()))
 
 
-@pytest.mark.slow
 def test_without_correlation_the_density_of_proportional_powers_is_a_closed_form():
     """∫ Π gamma(T p; a, E/a) T^(n-1) dT = Γ(Σa) Π a^a p^(a-1) / (Γ(a) E^a) / (Σ a p / E)^Σa."""
     target = jm.load_target("vastus-lateralis-26mvc")
@@ -122,7 +119,6 @@ def test_gamma_level():
     np.testing.assert_allclose(slope, np.log(a) + 1 - digamma(a), rtol=1e-12, atol=2e-6)
 
 
-@pytest.mark.slow
 def test_slopes_by_hand_are_those_of_differences():
     """With a line that fills some bins, one beyond the share that still scatters, and bins that are
     left out."""
@@ -145,7 +141,6 @@ def test_slopes_by_hand_are_those_of_differences():
     np.testing.assert_allclose(slopes, (ahead - behind) / (2 * steps), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.slow
 def test_scale_of_the_model_does_not_count():
     bins = jax.tree.map(jnp.asarray, measured_bins(jm.load_target("vastus-lateralis-26mvc")))
     E, line = jnp.linspace(1.0, 0.01, 30), jnp.zeros(30).at[10].set(0.3)
@@ -153,7 +148,6 @@ def test_scale_of_the_model_does_not_count():
     assert heights[0] == pytest.approx(heights[1], rel=1e-12)
 
 
-@pytest.mark.slow
 def test_offset_is_the_likeliest():
     bins = jax.tree.map(jnp.asarray, measured_bins(jm.load_target("fdi-abduction-45mvc")))
     E, line = jnp.linspace(1.0, 0.01, 30), jnp.zeros(30)
@@ -186,7 +180,6 @@ SHAPES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_score_and_information(shape):
     """At the truth the score has mean zero and the Fisher information as variance, over scipy's
@@ -233,7 +226,6 @@ def recording():
     return jm.Recording(np.asarray(runs.output[0]), 100, window=(5, 5 + seconds))
 
 
-@pytest.mark.slow
 def test_a_coefficient_of_variation_adds_its_gaussian_density():
     target = jm.load_target("vastus-lateralis-26mvc")
     bare = jm.Target("the spectrum", target.proportional_power, segments=target.segments)
@@ -256,7 +248,6 @@ def test_a_coefficient_of_variation_adds_its_gaussian_density():
         ) == pytest.approx(density, rel=1e-6)
 
 
-@pytest.mark.slow
 def test_whittle_is_the_law_of_a_periodogram():
     """With a line: scipy's noncentral chi-squared density of 2 I / N with noncentrality 2 L / N."""
     data = recording()
@@ -277,7 +268,6 @@ def test_whittle_is_the_law_of_a_periodogram():
 
 
 @pytest.mark.parametrize("name", ["vastus-lateralis-26mvc", "recording"])
-@pytest.mark.slow
 def test_likelihoods_are_differentiable(name):
     data = recording() if name == "recording" else jm.load_target(name)
 
@@ -291,7 +281,6 @@ def test_likelihoods_are_differentiable(name):
     assert float(slopes[1]) == pytest.approx(float(heights[2] - heights[0]) / (2 * step), rel=1e-5)
 
 
-@pytest.mark.slow
 def test_a_recording_prefers_the_muscle_that_made_it():
     data = recording()
     heights = [
@@ -300,7 +289,6 @@ def test_a_recording_prefers_the_muscle_that_made_it():
     assert np.argmax(heights) == 1
 
 
-@pytest.mark.slow
 def test_what_has_no_likelihood():
     with pytest.raises(ValueError, match="does not state its segments"):
         jm.log_likelihood(jm.Isometric(), jm.Target("bare", np.linspace(2, 1, 30)))

@@ -151,7 +151,6 @@ def test_every_claim_has_a_row_here():
     assert set(keys) == set(EXPECTED)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("key", EXPECTED)
 def test_the_numbers_and_the_verdict_of_a_row(rows, key):
     kind, verdict, *numbers = EXPECTED[key]
@@ -219,14 +218,12 @@ def test_only_what_tests_the_model_is_counted_for_it():
     )
 
 
-@pytest.mark.slow
 def test_the_document_counts_as_the_table_does(rows):
     assert counted(rows.values()) in (pages.ROOT / "docs" / "reproduce.md").read_text(
         encoding="utf-8"
     )
 
 
-@pytest.mark.slow
 def test_the_document_lists_what_does_not_agree(rows):
     """And what does: of each kind, by the keys of claims.json."""
     text = (pages.ROOT / "docs" / "reproduce.md").read_text(encoding="utf-8")
@@ -290,7 +287,6 @@ def test_an_inverted_u_rises_above_both_ends():
     assert rise(1.0, 2.0, 3.0) == rise(3.0, 2.0, 1.0) == 0
 
 
-@pytest.mark.slow
 def test_the_share_within_the_bins_against_a_simulation(done):
     """scipy's Welch of the 32 runs up to 50 Hz; few bins of slow noise hold much of the power, so
     the share errs by 2 %."""
@@ -300,7 +296,6 @@ def test_the_share_within_the_bins_against_a_simulation(done):
     assert power[1:31].sum() / power[1:].sum() == pytest.approx(done[0].slifkin.within, rel=0.06)
 
 
-@pytest.mark.slow
 def test_the_three_readings(done):
     """A lacks the low sine, B (which has it) is not Task 1, B in Task 1 has no second maximum, C no
     local maximum."""
@@ -339,7 +334,6 @@ def test_fast_share_of_known_signals():
     assert fast_share(both, 100.0) == pytest.approx(0.1, rel=1e-9)
 
 
-@pytest.mark.slow
 def test_task_2_is_held_by_constant_forces_at_1_mm(done):
     run = done[0].slifkin.displacement
     task = run.task
@@ -349,7 +343,6 @@ def test_task_2_is_held_by_constant_forces_at_1_mm(done):
     assert np.mean(np.asarray(run.between())) == pytest.approx(1e-3, rel=0.01)
 
 
-@pytest.mark.slow
 def test_figures_and_page_are_written(done):
     folder = done[1]
     for name in FIGURES:
@@ -393,7 +386,6 @@ class _Page(HTMLParser):
         assert self.open.pop() == tag
 
 
-@pytest.mark.slow
 def test_the_page_is_whole_and_needs_no_network(done):
     folder = done[1]
     text = (folder / "index.html").read_text(encoding="utf-8")
@@ -431,7 +423,6 @@ def test_own_recordings_take_the_place_of_the_simulated_ones():
     assert max(found.rho_fft) < 0.3  # white noise: bins are ranked by chance
 
 
-@pytest.mark.slow
 def test_recordings_of_different_length_are_cut_to_the_shortest():
     found = experiment(given_recordings(_recordings((60.0, 45.0, 52.0))))
     assert {r.duration for r in found.recordings} == {45.0}

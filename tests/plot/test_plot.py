@@ -235,7 +235,6 @@ def test_trajectory_of_a_displacement():
     assert ax.get_ylabel() == r"Acceleration $a_\mathrm{z}$ (m/s²)"
 
 
-@pytest.mark.slow
 def test_simulation_shows_run_window_and_spectra():
     runs = trajectories((3,))
     figure = plot.simulation(runs)
@@ -815,7 +814,6 @@ def test_a_study_has_one_key_that_lies_outside_all_spectra():
     assert [bool(ax.get_xlabel()) for ax in figure.axes] == [False, True, True]
 
 
-@pytest.mark.slow
 def test_a_dollar_in_a_name_is_no_mathematics():
     groups = ["$x_1$ at rest", "b"]
     people = cohort_of(groups=groups, name="$p$")
@@ -1002,7 +1000,6 @@ def refitted(
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "draw",
     [
@@ -1052,7 +1049,6 @@ def test_words_are_legible_in_a_column_of_a_journal_and_do_not_touch(draw):
     assert small_words(draw()) == ([], [], [])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("power", [1.0, 1e-6], ids=["fractions", "small"])
 @pytest.mark.parametrize("draw", [plot.spectrum, plot.target, plot.fit, plot.components])
 def test_no_number_of_a_logarithmic_axis_has_a_small_exponent(draw, power):

@@ -35,7 +35,6 @@ def told(folder):
     return " | ".join(word for word in seen.words if word.strip()), seen
 
 
-@pytest.mark.slow
 def test_of_a_fit(tmp_path):
     target = jm.Target(HOSTILE, POWER, segments=[6], notices=[HOSTILE])
     result = made_result(target=target, notices=(HOSTILE,))
@@ -94,7 +93,6 @@ def test_what_to_do_depends_on_the_verdict(case, tmp_path):
     ] == [f"verdict {kind}"]
 
 
-@pytest.mark.slow
 def test_of_a_cohort(tmp_path):
     results = {
         HOSTILE: made_result(target=jm.Target(HOSTILE, POWER, segments=[6])),
@@ -109,7 +107,6 @@ def test_of_a_cohort(tmp_path):
     assert not (tmp_path / "a" / "report.html").exists()
 
 
-@pytest.mark.slow
 def test_of_a_study(tmp_path):
     study = made_study()
     study_report(study, tmp_path)

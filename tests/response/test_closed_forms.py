@@ -78,7 +78,6 @@ def halved(path):
 SMALL = 2e-3  # second order effects of this noise are 1e-5 of its power
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "noise",
     [
@@ -137,7 +136,6 @@ def mean_velocity(task, dt, seeds=256):
     return means.mean(), means.std(ddof=1) / np.sqrt(seeds)
 
 
-@pytest.mark.slow
 def test_white_damping_noise_is_stratonovich(x64):
     """`dv = λ (1 - v) dt - √D v ∘ dW` has the mean λ / (λ - D/2); in the sense of Itô it would be
     1."""
@@ -164,7 +162,6 @@ def coloured_mean(cutoff):
     return RATE * scipy.integrate.simpson(np.exp(-RATE * tau + variance / 2), x=tau)
 
 
-@pytest.mark.slow
 def test_white_noise_is_the_limit_of_band_limited_noise(x64):
     limit = RATE / (RATE - DIFFUSION / 2)
     distance, standard = [], []

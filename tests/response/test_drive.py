@@ -63,7 +63,6 @@ TASKS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", some_slow(TASKS, ["two resonances", "shared", "motion", "force"]))
 def test_the_variance_is_the_integral_of_the_density(x64, name):
     task = TASKS[name]
@@ -89,7 +88,6 @@ SETTINGS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_spectrum_line_mean_and_variance_are_the_quadrature(x64, name):
     task = TASKS[name].with_parts(harmonic=RHYTHM)
@@ -110,7 +108,6 @@ ENVELOPES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ENVELOPES)
 def test_the_harmonic_through_the_activation_is_that_of_a_noise_free_simulation(x64, name):
     kind, inputs, harmonic = ENVELOPES[name]
@@ -136,7 +133,6 @@ ANY = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ANY)
 def test_any_linear_system(x64, name):
     """`C (s - A)⁻¹ B + D + s E` of numbers at random, also where no muscle of this package has any:
@@ -211,7 +207,6 @@ class Multiplied(jm.AbstractMuscle):
         return v_z - (force - (250.0 + u[1]) * (x_z - x_w)) / (5.0 + u[3])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", [jm.Isometric, jm.PrescribedMotion])
 def test_a_drive_that_multiplies(x64, kind):
     """By hand: the drive's noise is a force `F (1 - (x/ℓ)²) n`; in Isometric it moves the mass, a
@@ -257,7 +252,6 @@ def test_a_drive_that_multiplies(x64, kind):
 # --- all off, and beyond first order
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["drive", pytest.param("activation", marks=pytest.mark.slow)])
 def test_what_is_off_changes_no_spectrum(x64, name):
     task = TASKS[name]
@@ -310,7 +304,6 @@ def test_white_noise_counts_as_its_samples_in_the_second_order(x64, shared, acti
     np.testing.assert_allclose(added(white), added(band), rtol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("std", [0.8, 1.5])
 def test_negative_coefficients_behind_the_activation(std):
     """The activation smooths the noise of the active tissue, not that of the passive."""

@@ -354,14 +354,12 @@ def some_slow(names, fast):
 
 
 @pytest.mark.parametrize("name", some_slow(CASES, FAST))
-@pytest.mark.slow
 def test_closed_form_is_the_quadrature_of_the_transfer_functions(x64, name):
     kind, noise, changes = CASES[name]
     settings, window = Settings().replace(**changes), SHIFTED if name == "isometric, OU" else WINDOW
     assert_as_by_quadrature(kind(*INPUTS[kind], noise=noise, harmonic=RHYTHM), settings, window)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sampling", ["instant", "average", "filtered"])
 def test_acceleration_in_closed_form_is_the_quadrature(x64, sampling):
     """Of noise on all that moves it: band-limited, resonant on the drive, the active part
@@ -385,7 +383,6 @@ def filtered_and_not(task, settings, window):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "noise, rest",
     [(jm.BandLimitedNoise(BOTH), 1e-4), (jm.OrnsteinUhlenbeckNoise(BOTH, 0.05), 1e-3)],
@@ -412,7 +409,6 @@ def test_what_is_filtered_is_a_recording_of_a_signal_known_at_all_times(
     assert np.max(instant.power / expected) > 1.04
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("f", [0.4, 3.0, 11.0, 60.0])
 def test_the_transfer_function_of_acceleration_is_that_of_displacement_twice_differentiated(x64, f):
     omega = np.asarray(2 * np.pi * f)
@@ -474,7 +470,6 @@ def variance_of_a_line(settings, window, samples):
     )
 
 
-@pytest.mark.slow
 def test_the_variance_is_that_of_so_many_samples(x64):
     """A minute after 5 s, as a window or as samples from the begin of a shorter one; more slow
     noise is in it."""
@@ -493,7 +488,6 @@ def test_the_variance_is_that_of_so_many_samples(x64):
     np.testing.assert_array_equal(begun.power, short.power)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("phase", [0.0, np.pi / 2])
 def test_phase_of_a_slow_harmonic(x64, phase):
     """At 0.5 Hz the leakage from negative frequencies depends on the phase; a segment starts it
@@ -530,7 +524,6 @@ LAG = {"motion": 2e-3}
 
 
 @pytest.mark.parametrize("name", some_slow(ENVELOPES, ["isometric"]))
-@pytest.mark.slow
 def test_line_is_the_spectrum_of_a_noise_free_simulation(x64, name):
     kind, harmonic, changes = ENVELOPES[name]
     task = references.quiet(
@@ -545,7 +538,6 @@ def test_line_is_the_spectrum_of_a_noise_free_simulation(x64, name):
     )
 
 
-@pytest.mark.slow
 # the slow one has not forgotten by 5 s where it started from
 @pytest.mark.parametrize("c_w", [60.0, 6000.0])
 def test_an_envelope_that_does_not_change_is_a_constant_one(x64, c_w):
@@ -577,7 +569,6 @@ WHITE = np.eye(1, 2000)[0]
 RINGING = np.exp(-np.arange(2000) / 20) * np.cos(np.arange(2000) / 3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -655,7 +646,6 @@ def test_transforms_of_long_segments_are_the_matrices(x64, window, detrend):
     )
 
 
-@pytest.mark.slow
 def test_settled_tasks_rest(x64):
     for kind, inputs in INPUTS.items():
         held = jm.settled(kind(*inputs))
@@ -736,7 +726,6 @@ def test_every_derivative_forward_reverse_and_by_differences(x64, name):
     assert silent == SILENT_IN[name]
 
 
-@pytest.mark.slow
 def test_gradient_by_a_natural_name_under_jit_and_vmap(x64):
     task = jm.Isometric()
 
@@ -752,7 +741,6 @@ def test_gradient_by_a_natural_name_under_jit_and_vmap(x64):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", some_slow(["isometric, band-limited", "force, band-limited"], ["force, band-limited"])
 )
@@ -769,7 +757,6 @@ def test_single_precision(name):
     np.testing.assert_allclose(single, double, rtol=6e-8 * (280 + condition))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "samples, head", [(2, 1), (3, 1), (64, 1), (999, 1), (1000, 1), (1000, 20), (21, 20), (9, 20)]
 )
@@ -793,7 +780,6 @@ def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples, head):
 
 
 @pytest.mark.parametrize("name", ["zagrodny-slifkin", "zagrodny-hamilton"])
-@pytest.mark.slow
 def test_heavy_forces_on_soft_tissue_have_an_equilibrium_in_single_precision(name):
     """Accelerations of 1e3 m/s² are rounded by more than displacements of 1e-2 m are large."""
     task = jm.load_preset(name).as_task(jm.PrescribedForce)
@@ -832,7 +818,6 @@ class Crossbridge(jm.AbstractMuscle):
         return v_z - (force - (200.0 + u[1]) * (x_z - x_w)) / (5.0 + u[3])
 
 
-@pytest.mark.slow
 def test_one_trace_per_structure(x64, monkeypatch):
     monkeypatch.setattr(programs, "program_folder", lambda: None)  # nothing is loaded
     looks, settings = Crossbridge.looks, Settings(last_bin=29)
@@ -847,7 +832,6 @@ def test_one_trace_per_structure(x64, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", some_slow(INPUTS, [jm.Isometric]))
-@pytest.mark.slow
 def test_a_users_own_muscle_in_closed_form(x64, kind):
     """The same muscle out of jaxmuscle's parts: k (x_ref² + x²) with k x_ref² the stiffness and
     x_ref = 0.03."""
@@ -918,7 +902,6 @@ def test_the_mean_of_simulations_is_as_expected(x64):
     references.assert_standard_normal(z, every=3)
 
 
-@pytest.mark.slow
 def test_recordings_of_1_khz_are_as_expected_where_they_are_filtered(x64):
     """Decimated by scipy: spectrum and variation are those of "filtered"; of "instant" 5 % too
     large, with its aliases."""
@@ -946,7 +929,6 @@ def test_recordings_of_1_khz_are_as_expected_where_they_are_filtered(x64):
     np.testing.assert_allclose(runs.spectrum(settings, window).power, power, rtol=1e-8)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [0.0, 0.04], ids=["noise", "mostly a line"])
 def test_the_coefficient_of_variation_of_a_recording_scatters_as_expected(x64, amplitude):
     """Recordings of 9.6 s by the nonlinear simulator; 400 of them know their standard deviation to
@@ -1020,7 +1002,6 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-@pytest.mark.slow
 def test_what_has_no_linear_response(x64, name):
     task, message = REFUSED[name]
     with pytest.raises(jm.errors.OperatingPointError, match=message):
@@ -1042,7 +1023,6 @@ def test_an_undamped_motion_beside_a_fast_decay_is_told_from_rounding():
             check_equilibrium(jm.Isometric(), np.zeros(3), A)
 
 
-@pytest.mark.slow
 def test_without_an_equilibrium_under_a_transformation_it_is_not_finite(x64):
     @kept_jit
     def power(F_ext, k_w):
@@ -1071,7 +1051,6 @@ def test_nothing_to_see(x64):
         jm.expected_spectrum(jm.Isometric(P_w=0.0))
 
 
-@pytest.mark.slow
 def test_a_harmonic_beyond_half_the_sampling_rate(x64):
     task = jm.Isometric().replace(harmonic_frequency=50.0)
     with pytest.raises(

@@ -138,7 +138,6 @@ WRONG = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", WRONG)
 def test_what_cannot_be_carried_is_refused(case, tmp_path):
     stated, message = WRONG[case]

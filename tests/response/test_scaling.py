@@ -64,7 +64,6 @@ def test_the_steadiest_level_and_the_contrast_are_free():
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
-@pytest.mark.slow
 def test_variation_of_the_output_is_smallest_near_30_and_largest_at_95_percent(x64, task):
     seen = np.array([variation(at_level(task, level, resting=0.1)) for level in LEVELS])
     assert LEVELS[seen.argmin()] == pytest.approx(0.3)
@@ -73,7 +72,6 @@ def test_variation_of_the_output_is_smallest_near_30_and_largest_at_95_percent(x
     np.testing.assert_allclose(seen / seen.min(), law, rtol=1e-8)
 
 
-@pytest.mark.slow
 def test_simulated_variation_follows_the_law(x64):
     steady, weak, strong = (
         jm.settled(at_level(jm.Isometric(), level)) for level in (0.3, 0.05, 0.95)
@@ -96,7 +94,6 @@ def test_one_and_seven_tenths_percent_at_the_steadiest_level_stay_within_what_pe
     assert 1.3 < at[0.95] < 5.0 and 1.3 < at[0.05] < 5.0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_the_reference_is_the_task_itself_and_steps_add_up(x64, task):
     assert_same(at_level(task, 0.4, reference=0.4), task)
@@ -110,7 +107,6 @@ def test_the_reference_is_the_task_itself_and_steps_add_up(x64, task):
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
-@pytest.mark.slow
 def test_without_resting_stiffness_forces_follow_the_level_and_nothing_moves(x64, task):
     high = at_level(task, 0.9)
     np.testing.assert_allclose(
@@ -120,7 +116,6 @@ def test_without_resting_stiffness_forces_follow_the_level_and_nothing_moves(x64
     assert ratio == pytest.approx(3.0 if task.output_unit == "N" else 1.0, rel=1e-9)
 
 
-@pytest.mark.slow
 def test_the_spectrum_keeps_its_maximum_at_every_level(x64):
     """[30]: the maximum of power is at the same frequency at every level, proportional power varies
     slightly."""
@@ -142,7 +137,6 @@ def test_damping_keeps_the_corner_or_the_damping_ratio(x64):
         np.testing.assert_allclose(after[2:] / before[2:], (after[:2] / before[:2]) ** kept)
 
 
-@pytest.mark.slow
 def test_every_size_of_an_input_follows_and_its_times_stay():
     task = jm.Isometric(P_w=jm.model.RampHold(4.0, start=1.0, ramp=3.0, initial=2.0))
     moved = at_level(task, 0.6).P_w
@@ -153,7 +147,6 @@ def test_every_size_of_an_input_follows_and_its_times_stay():
 # --- size
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_variation_falls_with_strength(x64, task):
     seen = np.array([variation(scaled(task, size)) for size in SIZES])
@@ -164,7 +157,6 @@ def test_variation_falls_with_strength(x64, task):
 
 
 @pytest.mark.parametrize("exponent", [1.0, 0.0])
-@pytest.mark.slow
 def test_similar_muscles_have_similar_equilibria_and_rates(x64, exponent):
     task = jm.PrescribedForce(F_ext=1.0)
     large = scaled(task, 2.0, time_exponent=exponent)
@@ -180,7 +172,6 @@ def test_similar_muscles_have_similar_equilibria_and_rates(x64, exponent):
         np.testing.assert_allclose(slower, rates / 2, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_dynamic_similarity_is_exact_far_from_linear(x64):
     """Twice the size, times stretched by two: x ∝ s, force ∝ s², along the whole nonlinear run."""
     size = 2.0
@@ -202,7 +193,6 @@ def test_dynamic_similarity_is_exact_far_from_linear(x64):
     assert np.abs(here[:, 0]).max() > 2 * float(small["x_ref_w"])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_sizes_multiply(x64, task):
     assert_same(scaled(task, 1.0), task)
@@ -212,7 +202,6 @@ def test_sizes_multiply(x64, task):
 # --- both
 
 
-@pytest.mark.slow
 def test_derivatives_and_batches_go_through(x64):
     def change(level, size):
         task = scaled(at_level(jm.Isometric(), level), size)
@@ -310,7 +299,6 @@ def test_the_preset_has_the_papers_noise_and_a_smaller_changing_harmonic(hamilto
     assert float(envelope(15.0)) < 0.5 * float(envelope(5.0))
 
 
-@pytest.mark.slow
 def test_the_only_maximum_of_the_expected_force_is_bin_1(x64, hamilton):
     found = jm.spectra.peaks(jm.expected_spectrum(hamilton), min_prominence=0.0)
     assert found.maximum.bin == 1 and found.maximum.frequency == 0.390625
@@ -324,7 +312,6 @@ def played(hamilton):
         return jm.ensemble(hamilton, jax.random.key(12), seeds=100, chunk=8, control=False)
 
 
-@pytest.mark.slow
 def test_the_only_maximum_of_100_simulated_seeds_is_bin_1(x64, hamilton, played, capsys):
     found = jm.spectra.peaks(played.spectrum().mean())
     assert found.maximum.bin == 1 and not found.local_maxima
@@ -341,7 +328,6 @@ def test_the_only_maximum_of_100_simulated_seeds_is_bin_1(x64, hamilton, played,
     assert seen[0] == pytest.approx(expected[0], abs=0.05)
 
 
-@pytest.mark.slow
 def test_the_preset_is_smoother_and_its_amplitude_falls(x64, hamilton, played):
     beside = jm.load_preset("zagrodny-slifkin")
     smooth, rough = (
@@ -391,7 +377,6 @@ def test_carrying_back_is_the_task_and_a_displacement_cannot_be_carried(x64):
             jm.at_force(still, 3.0)
 
 
-@pytest.mark.slow
 def test_a_held_force_tells_no_length():
     """What the printed fit says: half of both x_ref, twice the stiffness k x_ref², damping and
     masses, the same force."""

@@ -60,7 +60,6 @@ def test_what_the_second_order_adds_is_what_a_simulation_has_more(task, x64):
     assert 0.5 < found.power[worst] / more[worst] < 2.0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "task",
     [
@@ -79,7 +78,6 @@ def test_nothing_is_said_where_simulation_and_linear_response_agree(task, x64):
         jm.expected_spectrum(task)
 
 
-@pytest.mark.slow
 def test_the_mean_of_a_squared_gaussian(x64):
     """A displacement that the stiffness K(x) = k (x_ref² + x²) answers: the mean shift against a
     simulation's."""
@@ -90,7 +88,6 @@ def test_the_mean_of_a_squared_gaussian(x64):
     assert second_order(task).mean == pytest.approx(shift, rel=0.5)
 
 
-@pytest.mark.slow
 def test_linear_numbers_come_with_a_warning_where_first_order_ends():
     loud = jm.Isometric().replace(harmonic_amplitude=0.3)
     for number in (jm.expected_spectrum, jm.sensitivity, lambda task: jm.at_level(task, 0.5)):
@@ -133,7 +130,6 @@ def test_a_harmonic_makes_coefficients_negative_as_often_as_a_sine_is_below():
 # --- refused before
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", MOVING)
 def test_an_input_that_moves_in_the_window_is_refused(name):
     task = jm.Isometric(P_w=MOVING[name])
@@ -153,7 +149,6 @@ def test_an_input_that_moves_in_the_window_is_refused(name):
     assert np.all(np.isfinite(np.asarray(jm.expected_spectrum(jm.settled(task)).power)))
 
 
-@pytest.mark.slow
 def test_an_input_that_is_held_in_the_window_is_not():
     for signal in (
         5.0,
@@ -166,7 +161,6 @@ def test_an_input_that_is_held_in_the_window_is_not():
         jm.expected_spectrum(jm.Isometric(), window=(0.5, 10.5))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_spectrum_of_rounding_is_refused(dtype):
     """Without external force noise on K_z does not move Task 2; what is left is the

@@ -16,7 +16,6 @@ def whole():
     return jm.sensitivity(TASK)
 
 
-@pytest.mark.slow
 def test_every_entry_is_a_difference_quotient(x64):
     names = ("k_w", "c_z", "noise_K_w", "harmonic_frequency", "x_z")
     found = jm.sensitivity(TASK, names)
@@ -41,7 +40,6 @@ def test_every_entry_is_a_difference_quotient(x64):
     assert list(found.relative) == [True, True, True, True, False]
 
 
-@pytest.mark.slow
 def test_the_scale_of_all_perturbations_moves_power_alone():
     """Power goes with the square of noise and harmonic together; its proportions do not change."""
     names = ("noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
@@ -50,7 +48,6 @@ def test_the_scale_of_all_perturbations_moves_power_alone():
     np.testing.assert_allclose(whole().proportional[rows].sum(axis=0), 0.0, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_the_table_has_its_labels():
     table = whole().to_xarray()
     assert table["proportional"].dims == ("parameter", "frequency")
@@ -63,7 +60,6 @@ def test_the_table_has_its_labels():
     assert said["x_ref_w"] == "0.02 m" and said["noise_K_w"] == f"{float(TASK['noise_K_w']):.4g}"
 
 
-@pytest.mark.slow
 def test_the_heat_map_names_what_matters():
     ax = whole().plot()
     labels = [text.get_text() for text in ax.get_yticklabels()]

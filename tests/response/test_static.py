@@ -43,7 +43,6 @@ class Tendon(jm.AbstractMuscle):
 
 
 @pytest.mark.parametrize("argument", ["literal", "elongation"])
-@pytest.mark.slow
 def test_the_papers_laws_are_found(argument):
     task = jm.Isometric(muscle=jm.Muscle(argument=argument)).replace(
         k_z=3e5, c_w=50.0, x_ref_w=0.01
@@ -60,7 +59,6 @@ def test_the_papers_laws_are_found(argument):
     np.testing.assert_allclose(seen.F_z, seen.K_z * x, **EXACT)
 
 
-@pytest.mark.slow
 def test_force_at_the_insertion_solves_the_statics():
     seen = static_characteristics(jm.Isometric(), points=41)
     for x, force, P in [
@@ -76,7 +74,6 @@ def test_force_at_the_insertion_solves_the_statics():
 
 
 @pytest.mark.parametrize("kind", [jm.Isometric, jm.PrescribedForce, jm.PrescribedMotion])
-@pytest.mark.slow
 def test_the_operating_point_is_the_tasks(kind):
     task = kind()
     seen = static_characteristics(task)
@@ -88,7 +85,6 @@ def test_the_operating_point_is_the_tasks(kind):
     assert middle == pytest.approx(load, abs=2e-3)
 
 
-@pytest.mark.slow
 def test_a_users_muscle_is_seen_through_its_methods():
     seen = static_characteristics(jm.Isometric(muscle=Tendon()), span=0.02)
     x = seen.displacement
@@ -104,14 +100,12 @@ def test_a_users_muscle_is_seen_through_its_methods():
     plt.close("all")
 
 
-@pytest.mark.slow
 def test_every_field_has_a_unit_and_the_range_contains_the_operating_point():
     seen = static_characteristics(jm.load_preset("zagrodny-slifkin"))
     assert set(seen.units) == {field.name for field in dataclasses.fields(seen)}
     assert seen.displacement[-1] == pytest.approx(2 * seen.x_w)
 
 
-@pytest.mark.slow
 def test_the_figure_has_units_a_legend_and_the_callers_axes():
     seen = static_characteristics(jm.Isometric())
     figure, given = plt.subplots(1, 3)

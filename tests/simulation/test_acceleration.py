@@ -12,7 +12,6 @@ KEY = jax.random.key(53)
 RHYTHM = jm.Harmonic(0.02, 9.0)
 
 
-@pytest.mark.slow
 def test_it_is_the_second_difference_of_the_simulated_motion(x64):
     """To second order in the step, without noise and beside noise on K_w: x_z'' then has two
     derivatives."""
@@ -64,7 +63,6 @@ def test_plain_monte_carlo_has_the_expected_spectrum(x64):
     assert abs(means.mean() - still) < 4 * means.std(ddof=1) / np.sqrt(len(means))
 
 
-@pytest.mark.slow
 def test_a_file_says_what_it_holds(tmp_path):
     task = jm.PrescribedForce(observe="acceleration")
     found = jm.ensemble(task, KEY, seeds=4, store=tmp_path / "runs.zarr")

@@ -99,7 +99,6 @@ TOGETHER = {"chunk": 32}
 
 
 @pytest.mark.parametrize("kind", INPUTS)
-@pytest.mark.slow
 def test_linear_trajectories_have_the_expected_spectrum(x64, kind):
     """`E l` is exact: the mean over 128 seeds, one path each beside the nonlinear task."""
     runs = jm.ensemble(jm.settled(made(kind, "band-limited", "human")), KEY, seeds=128, **TOGETHER)
@@ -122,7 +121,6 @@ AT_PAPER_LEVEL = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", AT_PAPER_LEVEL)
 def test_at_the_papers_amplitudes_the_response_is_linear(x64, name):
     estimate = jm.ensemble(
@@ -133,13 +131,11 @@ def test_at_the_papers_amplitudes_the_response_is_linear(x64, name):
     assert np.median(estimate.variance_reduction) >= 10_000
 
 
-@pytest.mark.slow
 def test_at_human_amplitudes_most_of_the_variance_goes(x64):
     estimate = jm.ensemble(jm.settled(VASTUS), KEY, seeds=32, **TOGETHER).mean_spectrum()
     assert np.median(estimate.variance_reduction) >= 200
 
 
-@pytest.mark.slow
 def test_the_nonlinear_part_of_large_noise_is_seen(x64):
     """Stiffness noise of 15 % that lasts 0.1 s: a percent or two of each bin, which plain 256 seeds
     cannot tell."""
@@ -155,7 +151,6 @@ def test_the_nonlinear_part_of_large_noise_is_seen(x64):
     assert np.all(np.abs(estimate.nonlinearity) < 0.05)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", [jm.Isometric, jm.PrescribedForce])
 def test_the_controlled_estimate_has_no_linear_time_step_error(x64, kind):
     """Steps of 5 and 2.5 ms on the same paths, which band-limited noise has exactly on each
@@ -193,7 +188,6 @@ def test_the_controlled_estimate_has_no_linear_time_step_error(x64, kind):
     assert np.all(plain / 12 < 0.22 * many)
 
 
-@pytest.mark.slow
 def test_control_changes_no_trajectory_and_comes_in_chunks(x64):
     options = {"seeds": np.array([3, 0, 7, 5, 1, 4, 2, 6, 9, 8]), "dt": 2.5e-3, "chunk": 8}
     task = jm.Isometric()
@@ -216,7 +210,6 @@ def test_control_changes_no_trajectory_and_comes_in_chunks(x64):
     )
 
 
-@pytest.mark.slow
 def test_what_an_estimate_holds(x64):
     runs = jm.ensemble(jm.Isometric(), KEY, seeds=8, dt=2.5e-3, control=True)
     settings = jm.SpectrumSettings(first_bin=2, last_bin=20, detrend="linear")
@@ -238,7 +231,6 @@ def test_what_an_estimate_holds(x64):
     assert (estimate.seeds, estimate.unit, estimate.settings) == (8, "N", settings)
 
 
-@pytest.mark.slow
 def test_one_seed_has_a_spectrum_but_no_error(x64):
     estimate = jm.simulate(jm.Isometric(), KEY).mean_spectrum()
     assert estimate.seeds == 1 and estimate.expected is None
@@ -270,7 +262,6 @@ IMPOSSIBLE = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", IMPOSSIBLE)
 def test_where_control_cannot_be(name):
     task, options, message = IMPOSSIBLE[name]
@@ -294,7 +285,6 @@ def test_slow_beside_fast_motion_is_damped_also_in_single_precision():
     )
 
 
-@pytest.mark.slow
 def test_control_by_default_where_it_pays(x64):
     assert jm.ensemble(jm.Isometric(), KEY, seeds=8, dt=2.5e-3).linear is not None
     for task in (SLOW, UNDAMPED):
@@ -302,12 +292,10 @@ def test_control_by_default_where_it_pays(x64):
     assert jm.ensemble(jm.Isometric(), KEY, seeds=2, duration=1.0).linear is None
 
 
-@pytest.mark.slow
 def test_a_settled_task_has_no_transient_however_slow(x64):
     assert jm.ensemble(jm.settled(SLOW), KEY, seeds=32, **TOGETHER).linear is not None
 
 
-@pytest.mark.slow
 def test_without_what_a_controlled_mean_needs(x64):
     plain = jm.ensemble(jm.Isometric(), KEY, seeds=8, dt=2.5e-3, control=False)
     with pytest.raises(
@@ -332,7 +320,6 @@ def test_without_what_a_controlled_mean_needs(x64):
     assert runs.mean_spectrum(average).expected is None
 
 
-@pytest.mark.slow
 def test_under_a_transformation(x64):
     def linear(k_w):
         options = {"seeds": 2, "duration": 0.5, "dt": 5e-3, "control": True}
@@ -344,7 +331,6 @@ def test_under_a_transformation(x64):
     assert output.shape == (2, 51) and np.all(np.isfinite(output)) and output.std() > 0
 
 
-@pytest.mark.slow
 def test_single_precision_estimates_the_same():
     def estimate():
         task = jm.settled(made(jm.Isometric, "band-limited", "paper"))
@@ -361,7 +347,6 @@ def test_single_precision_estimates_the_same():
 
 
 @pytest.mark.parametrize("kind", INPUTS)
-@pytest.mark.slow
 def test_the_linear_task_is_the_tangent(x64, kind):
     """What is left of vector field and output falls with the square of the distance."""
     task, rng = as_arrays(kind(*INPUTS[kind])), np.random.default_rng(0)

@@ -57,7 +57,6 @@ def test_the_stiffness_is_that_of_two_tissues_in_series():
     np.testing.assert_allclose(found, formula(FREQUENCY), rtol=1e-10)
 
 
-@pytest.mark.slow
 def test_forward_reverse_and_differences_agree():
     with jax.enable_x64(True):
 
@@ -75,7 +74,6 @@ def test_forward_reverse_and_differences_agree():
     np.testing.assert_allclose(between, forward, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_a_small_motion_is_answered_linearly():
     """The issue's bound: 1e-4 relative."""
     lines, motion = multisine(1e-6)
@@ -132,7 +130,6 @@ def test_a_large_motion_is_answered_as_scipy_integrates_it(m_w, close):
     np.testing.assert_allclose(force, expected, atol=close * np.max(np.abs(expected)))
 
 
-@pytest.mark.slow
 def test_simulate_moves_the_insertion():
     """The ordinary simulation with the motion as a signal, without noise, against the same at fixed
     steps."""
@@ -149,7 +146,6 @@ def test_simulate_moves_the_insertion():
     np.testing.assert_allclose(seen[1:], expected[::5][1 : len(seen)], atol=2e-4 * np.ptp(expected))
 
 
-@pytest.mark.slow
 def test_an_insertion_at_rest_is_isometric():
     one = jm.PrescribedLength(x_z=0.003)
     other = jm.Isometric(x_z=0.003)

@@ -29,7 +29,6 @@ SUBSTEPS = {"all": 2}
 WITHOUT_INFLUENCE = {"motion": (), "force": (), "acceleration": (), "all": ("m_z",)}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_every_parameter_forward_reverse_and_by_differences(x64, name):
     task = TASKS[name].replace(harmonic_phase=0.4, harmonic_amplitude=0.02)
@@ -67,7 +66,6 @@ def test_every_parameter_forward_reverse_and_by_differences(x64, name):
     assert tuple(silent) == WITHOUT_INFLUENCE[name]
 
 
-@pytest.mark.slow
 def test_a_parameter_by_its_natural_name(x64):
     task = jm.Isometric()
 
@@ -81,7 +79,6 @@ def test_a_parameter_by_its_natural_name(x64):
     )
 
 
-@pytest.mark.slow
 def test_a_mean_spectrum_and_the_filtered_output_by_differences(x64):
     """Also with the control variate, and the numbers are those without derivatives."""
 

@@ -57,7 +57,6 @@ def test_plain_monte_carlo_agrees_on_every_rung(x64):
     references.assert_standard_normal(z, every=3)
 
 
-@pytest.mark.slow
 def test_the_control_variate_has_the_expected_spectrum(x64):
     runs = jm.ensemble(RUNGS["two"], KEY, seeds=128, chunk=32)
     power = np.asarray(runs.beside().spectrum().power)
@@ -105,7 +104,6 @@ def path(noise=jm.BandLimitedNoise(HUMAN), activation=None):  # noqa: B008
     return np.asarray(jm.simulate(task, KEY, duration=1.0, dt=1e-4, substeps=1).output)
 
 
-@pytest.mark.slow
 def test_what_is_off_changes_no_path(x64):
     """A sum of one, and a resonance of no size on the drive: behind an activation, and without
     one."""
@@ -121,7 +119,6 @@ def test_what_is_off_changes_no_path(x64):
     assert np.abs(path(noise + jm.ResonantNoise(0.01)) - output).max() > 1e-4 * np.abs(output).max()
 
 
-@pytest.mark.slow
 def test_a_fast_activation_is_none(x64):
     """The delay 2T of 0.4 ms is a hundredth of that of the other."""
     quick, slowed, none = (

@@ -94,7 +94,6 @@ def moving(noise):
 FACTORS = np.array([4, 16])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "noise, order",
     [
@@ -122,7 +121,6 @@ def test_strong_order(x64, noise, order):
     assert abs(references.observed_order(steps, errors) - order) < 0.15, errors
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "amplitude, lowest, bound",
     [

@@ -94,7 +94,6 @@ DETERMINISTIC = [
 
 
 @pytest.mark.parametrize("task, reference", DETERMINISTIC)
-@pytest.mark.slow
 def test_without_noise_the_result_is_scipys_to_second_order(x64, task, reference):
     task = references.quiet(task.with_parts(harmonic=HARMONIC), k_w=4e5, c_w=50.0)
     states, output = reference(task, np.arange(301) / 100)
@@ -116,7 +115,6 @@ def test_without_noise_the_result_is_scipys_to_second_order(x64, task, reference
         assert 1.85 < references.observed_order([2e-3, 1e-3], column) < 2.2, errors
 
 
-@pytest.mark.slow
 def test_a_stiff_task_gets_sub_steps_and_the_right_answer(x64):
     # C_w0 / m_w = 4000/s
     task = references.quiet(jm.Isometric(5.0, 0.003, harmonic=HARMONIC), c_w=2000.0)
@@ -184,7 +182,6 @@ class Integral(jm.model.AbstractTask):
         (150, 3, 49, "float64"),
     ],
 )
-@pytest.mark.slow
 def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
     """diffrax rounds the times of steps: none may find its neighbour's noise."""
     with jax.enable_x64(precision == "float64"):
@@ -209,7 +206,6 @@ def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
 
 
 @pytest.mark.parametrize("task", ["motion", "force", "isometric"])
-@pytest.mark.slow
 def test_tables_of_inputs_and_harmonic_change_nothing(x64, task):
     """A traced call, which may be differentiated in reverse, evaluates them in the loop; a plain
     one looks them up."""
@@ -238,7 +234,6 @@ TASKS = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "task, precision", list(zip(TASKS, ("float32", "float64", "float32"), strict=True))
 )
@@ -269,7 +264,6 @@ def test_a_seed_is_the_same_whatever_the_batch(task, precision):
             )
 
 
-@pytest.mark.slow
 def test_single_precision_follows_double():
     task = references.quiet(jm.PrescribedForce(5.0, 1.0))
     single = jm.simulate(task, KEY)
@@ -280,7 +274,6 @@ def test_single_precision_follows_double():
     )
 
 
-@pytest.mark.slow
 def test_other_keys_and_seeds_are_other_noise():
     task = TASKS[2]
     a, b = (jm.simulate(task, jax.random.key(k), duration=2.0).output for k in (0, 1))
@@ -288,14 +281,12 @@ def test_other_keys_and_seeds_are_other_noise():
     assert np.abs(a - b).max() > 1e-3 and np.abs(a - c).max() > 1e-3
 
 
-@pytest.mark.slow
 def test_seed_i_folds_i_into_the_key():
     found = streams_of(KEY, jnp.array([3, 70]), Draws())
     for i, words in zip((3, 70), found.words, strict=True):
         np.testing.assert_array_equal(words, Stream.of(jax.random.fold_in(KEY, i)).words)
 
 
-@pytest.mark.slow
 def test_what_does_not_stay_finite_is_named():
     task = jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise({"C_w": 30.0}))
     with pytest.raises(jm.errors.SimulationError) as error:
@@ -382,7 +373,6 @@ def test_impossible_ensembles_are_refused():
         jm.ensemble(jm.Isometric(), KEY, seeds=1, chunk=0)
 
 
-@pytest.mark.slow
 def test_averages_are_those_of_a_fine_run(x64):
     task = jm.Isometric(noise=jm.BandLimitedNoise(0.1))
     fine = np.asarray(jm.simulate(task, KEY, duration=1.0, rate=1000.0).output)
@@ -406,7 +396,6 @@ def test_averages_are_those_of_a_fine_run(x64):
     )
 
 
-@pytest.mark.slow
 def test_sampling_and_window():
     run = jm.simulate(jm.Isometric(), KEY, duration=3.0, rate=200.0)
     assert run.output.shape == (601,) and run.states.shape == (601, 2)
@@ -424,7 +413,6 @@ def test_sampling_and_window():
         run.spectrum(jm.SpectrumSettings(rate=150.0), window=(0.0, 3.0))
 
 
-@pytest.mark.slow
 def test_ensembles_under_vmap_and_jit(x64):
     task = jm.Isometric()
     stiffness = jnp.array([4e5, 6e5])
@@ -439,7 +427,6 @@ def test_ensembles_under_vmap_and_jit(x64):
     assert np.abs(both[0] - both[1]).max() > 1e-2
 
 
-@pytest.mark.slow
 def test_other_values_do_not_compile_again():
     traces = []
 
@@ -466,7 +453,6 @@ def test_other_values_do_not_compile_again():
     assert compilations(task.replace(k_w=jnp.asarray(3e5)), 2, 3) == 0
 
 
-@pytest.mark.slow
 def test_xarray_says_what_it_holds(tmp_path):
     import xarray
 
@@ -502,7 +488,6 @@ def test_xarray_says_what_it_holds(tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_a_trajectory_is_a_tree():
     run = jm.simulate(jm.Isometric(), KEY)
     doubled = eqx.tree_at(lambda r: r.output, run, 2 * run.output)
@@ -520,7 +505,6 @@ def test_a_task_whose_equations_are_not_finite_is_refused():
             jm.simulate(task, jax.random.key(0))
 
 
-@pytest.mark.slow
 def test_the_runs_of_an_ensemble_are_taken_by_their_place():
     runs = jm.ensemble(jm.Isometric(), KEY, seeds=3)
     assert len(runs) == 3 and [int(run.seeds) for run in runs] == [0, 1, 2]

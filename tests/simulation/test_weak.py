@@ -49,7 +49,6 @@ def at_the_end(task, dt, increments, seeds=400_000, seconds=1.0, key=KEY):
     return float(found.mean[-1]), float(found.variance[-1])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("increments", ["weak", "gaussian"])
 def test_weak_order_of_geometric_brownian_motion(x64, increments):
     """Stratonovich, σ = 1: E(1 + y) = exp(-3/2 t), E(1 + y)² = exp(-2 t); Heun's mean is of order
@@ -78,7 +77,6 @@ def test_weak_order_of_geometric_brownian_motion(x64, increments):
     assert abs(references.observed_order(dts, np.abs(errors)) - 1.14) < 0.2, errors
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("increments", ["weak", "gaussian"])
 def test_moments_of_a_linear_task_are_exact(x64, increments):
     """`y' = N - 3 y` with an Ornstein-Uhlenbeck N of unit variance and rate 5/s, from rest."""
@@ -141,7 +139,6 @@ def test_expectations_of_a_nonlinear_task_are_those_of_gaussian_noise(x64, name)
     )
 
 
-@pytest.mark.slow
 def test_weak_increments_are_for_expectations():
     task = jm.Isometric()
     with pytest.raises(
@@ -167,7 +164,6 @@ def test_unknown_random_numbers_are_refused():
         jm.ensemble(jm.Isometric(), KEY, seeds=4, generator="philox")
 
 
-@pytest.mark.slow
 def test_the_generator_and_the_increments_change_the_noise():
     ways: list[dict[str, Any]] = [{}, {"generator": "threefry"}, {"increments": "weak"}]
     made = [

@@ -28,7 +28,6 @@ def test_single_precision_keeps_the_digits_of_the_fluctuations():
     )
 
 
-@pytest.mark.slow
 def test_gradients_are_those_of_a_linear_map(x64):
     x = np.random.default_rng(1).normal(size=81)
     forward, reverse = (of(lambda x: decimated(x, 4))(x) for of in (jax.jacfwd, jax.jacrev))

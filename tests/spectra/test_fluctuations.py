@@ -40,7 +40,6 @@ def test_dfa_is_its_definition():
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDS)
 def test_dfa_is_that_of_antropy(name):
     import antropy  # takes 7 s: not in every worker

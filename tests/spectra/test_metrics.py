@@ -63,7 +63,6 @@ def slow_sample_entropy(x, m, tolerance):
     return np.log(b / a)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDS)
 @pytest.mark.parametrize("m, tolerance", [(1, 0.3), (2, 0.2), (3, 0.5)])
 def test_entropies_are_their_definitions(name, m, tolerance):
@@ -74,7 +73,6 @@ def test_entropies_are_their_definitions(name, m, tolerance):
     assert sample_entropy(x, m, tolerance) == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDS)
 def test_entropies_are_those_of_antropy(name):
     import antropy  # takes 7 s: not in every worker
@@ -84,7 +82,6 @@ def test_entropies_are_those_of_antropy(name):
     assert sample_entropy(x) == pytest.approx(antropy.sample_entropy(x), abs=1e-10)
 
 
-@pytest.mark.slow
 def test_sample_entropy_of_white_noise():
     """Independent normal samples match with probability erf(r/2), so SampEn = -ln erf(r/2), for r
     in σ."""
@@ -163,7 +160,6 @@ def test_variation_and_signal_to_noise(x64, dtype):
     np.testing.assert_allclose(ratio, mean / deviation, rtol=rtol)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("metric", [coefficient_of_variation, signal_to_noise])
 def test_derivatives_agree(x64, metric):
     signal = jnp.asarray(5 + RNG.standard_normal(20))
@@ -176,7 +172,6 @@ def test_derivatives_agree(x64, metric):
     np.testing.assert_allclose(forward, differences, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_constant_and_centred_signals(x64):
     constant = jnp.full(8, 3.0)
     assert coefficient_of_variation(constant) == 0
@@ -271,7 +266,6 @@ def test_interpolation_finds_a_sine(x64, hertz):
     assert peak.interpolated == pytest.approx(hertz, abs=0.02 * settings.resolution)
 
 
-@pytest.mark.slow
 def test_peaks_need_one_spectrum(user_view):
     for power, message in (
         (np.ones((2, 5)), "mean()"),

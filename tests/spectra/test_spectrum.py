@@ -75,7 +75,6 @@ def user_view():
 @pytest.mark.parametrize(
     "settings", GRID, ids=lambda s: f"{s.window}-{s.overlap}-{s.detrend}-{s.length}"
 )
-@pytest.mark.slow
 def test_welch_is_scipy(x64, settings):
     frequency, power = scipy_welch(FORCE, settings)
     np.testing.assert_allclose(settings.frequency, frequency, rtol=1e-14)
@@ -127,14 +126,12 @@ def test_the_window_is_cut_after_the_filter(x64):
     assert (spectrum.unit, spectrum.settings) == ("mm", chosen)
 
 
-@pytest.mark.slow
 def test_without_cutoff_nothing_is_filtered(x64):
     chosen = SpectrumSettings(filter_cutoff=None)
     # One is compiled as a whole, the other step by step: the same up to rounding.
     np.testing.assert_allclose(spectrum_of(FORCE, chosen).power, welch(FORCE, chosen), rtol=1e-14)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("window", ["hann", "boxcar"])
 @pytest.mark.parametrize("samples", [999, 1000])
 def test_periodogram_is_scipy(x64, window, samples):
@@ -167,7 +164,6 @@ def plain_spectra():
 
 @settings(max_examples=40)
 @given(records)
-@pytest.mark.slow
 def test_power_adds_up_to_the_variance(record):
     with jax.enable_x64(True):
         powers, (frequency, power) = jax.tree.map(np.asarray, plain_spectra()(record))
@@ -178,7 +174,6 @@ def test_power_adds_up_to_the_variance(record):
     np.testing.assert_allclose(np.sum(power) * frequency[1], np.var(record), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("direction", ["forward", "both"])
 def test_derivatives_agree(x64, direction):
     chosen = SpectrumSettings(length=64, last_bin=20, filter_direction=direction)
@@ -206,7 +201,6 @@ def test_derivatives_agree(x64, direction):
     np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-5 * np.max(np.abs(forward)))
 
 
-@pytest.mark.slow
 def test_jit_and_vmap_change_nothing(x64):
     chosen = SpectrumSettings()
     power = spectrum_of(FORCE, chosen).power
@@ -221,7 +215,6 @@ def test_jit_and_vmap_change_nothing(x64):
     np.testing.assert_allclose(jitted, welch(FORCE, chosen), rtol=ROUNDING)
 
 
-@pytest.mark.slow
 def test_whole_numbers_are_samples_too(x64):
     counts = np.arange(300) % 7
     np.testing.assert_array_equal(
@@ -244,7 +237,6 @@ def test_degrees_of_freedom_of_the_design():
     assert SpectrumSettings(overlap=0.0).degrees_of_freedom(7) == pytest.approx(14, rel=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "window, overlap", [("hann", 0.5), ("hann", 0.75), ("hamming", 0.5), ("boxcar", 0.5)]
 )
@@ -285,7 +277,6 @@ def test_overlap_is_not_lost_to_rounding():
     assert SpectrumSettings(length=255, overlap=0.5).step == 128  # scipy: nperseg // 2 shared
 
 
-@pytest.mark.slow
 def test_pwelch_puts_the_mean_into_the_first_bin(x64):
     noise = 0.1 * np.random.default_rng(3).standard_normal(1000)
     matlab = Spectrum(
@@ -373,7 +364,6 @@ def test_names():
         SpectrumSettings.named("slwo")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, window", [("slow", ["hann"]), ("multitaper", scipy.signal.windows.dpss(1000, 2, 3))]
 )
@@ -392,7 +382,6 @@ def test_spectra_of_long_segments_are_scipys(x64, name, window):
     np.testing.assert_allclose(chosen.frequency, np.arange(chosen.first_bin, 118) / 10)
 
 
-@pytest.mark.slow
 def test_a_drift_leaves_slow_spectra_alone(x64):
     """A straight line of any steepness: nothing of it is in a bin, where removing the mean alone
     leaves a lot."""

@@ -123,7 +123,6 @@ def coloured(realisations, segments, corner, seed=1):
     return welch_powers(np.fft.irfft(np.fft.rfft(noise) * shape)[:, :samples], settings)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("corner", [np.inf, 0.9], ids=["white", "falling"])
 def test_statistics_are_those_of_measured_log_powers(corner):
     """Also of bin 1, which detrending and negative frequencies leave 0.8 times the degrees of
@@ -147,7 +146,6 @@ def test_statistics_are_those_of_measured_log_powers(corner):
     assert statistics.known
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "tapers"), [("slow", ["hann"]), ("multitaper", scipy.signal.windows.dpss(1000, 2, 3))]
 )
@@ -204,7 +202,6 @@ def test_statistics_of_several_trials_add_their_degrees_of_freedom():
     np.testing.assert_allclose(three.correlation, one.correlation, atol=1e-15)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("overlap", [0.0, 0.5])
 def test_a_line_does_not_scatter(overlap):
     """A sine in white noise: a bin has 1 / (1 - share²) times the degrees of freedom."""
@@ -252,7 +249,6 @@ def test_statistics_from_sigma_and_from_nothing():
     np.testing.assert_array_equal(unknown.sd, 1.0)
 
 
-@pytest.mark.slow
 def test_the_true_spectrum_gives_the_stated_chi2():
     """Design 6: 0.97 ± 0.31 for a recording of twelve segments."""
     target = jm.Target("white", FLAT, segments=12)

@@ -135,7 +135,6 @@ def same_information(found, expected):
 # --- the information of the data
 
 
-@pytest.mark.slow
 def test_the_information_is_that_of_log_contrasts(x64):
     problem, theta = setup_at(fitted())
     same_information(
@@ -144,7 +143,6 @@ def test_the_information_is_that_of_log_contrasts(x64):
     )
 
 
-@pytest.mark.slow
 def test_a_coefficient_of_variation_adds_its_gradient(x64):
     result = fitted(coefficient_of_variation=0.015)
     problem, theta = setup_at(result)
@@ -199,7 +197,6 @@ def highest_posteriors(result, count):
     )
 
 
-@pytest.mark.slow
 def test_where_all_is_determined_maxima_scatter_by_the_inverse_information(x64):
     """Four parameters that a spectrum determines; the whole covariance, by its Wishart law."""
     free = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency")
@@ -230,7 +227,6 @@ def test_where_all_is_determined_maxima_scatter_by_the_inverse_information(x64):
         np.testing.assert_allclose(known.left, np.sqrt(gain[i, i]), rtol=DIGITS)
 
 
-@pytest.mark.slow
 def test_determined_quantities_scatter_as_the_report_says(x64):
     """All eight parameters: four directions are open, and the maxima go far along them."""
     result, count = fitted(), 300
@@ -302,7 +298,6 @@ def test_a_known_mean_is_known_as_well_as_it_was_measured():
     )
 
 
-@pytest.mark.slow
 def test_a_design_at_other_values_knows_the_factors(x64):
     """Information about θ at the design's own values, as if its task had been fitted."""
     stronger = jm.at_level(TRUTH, 0.5)
@@ -335,7 +330,6 @@ def test_separate_parameters_are_eliminated(x64):
     assert np.linalg.eigvalsh(tied - loose)[0] > -1e-9 * np.abs(tied).max()
 
 
-@pytest.mark.slow
 def test_the_load_keeps_the_operating_point(x64):
     result = fitted()
     design = next(d for d in jm.standard_designs(result) if "displacement" in d.name)
@@ -382,7 +376,6 @@ def test_the_load_keeps_the_operating_point(x64):
     ],
     ids=["isometric", "all numbers known", "force"],
 )
-@pytest.mark.slow
 def test_the_usual_designs(result, names):
     designs = jm.standard_designs(result())
     assert [design.name for design in designs] == names
@@ -390,7 +383,6 @@ def test_the_usual_designs(result, names):
         assert (design.separate == AMPLITUDES) is design.name.startswith("a second force level")
 
 
-@pytest.mark.slow
 def test_the_usual_designs_of_a_motion(monkeypatch):
     """They follow from its moments alone: slopes are not compiled for this task."""
     monkeypatch.setattr(
@@ -422,7 +414,6 @@ def report() -> jm.uncertainty.IdentifiabilityReport:
     return jm.identifiability(fitted(coefficient_of_variation=0.016))
 
 
-@pytest.mark.slow
 def test_the_report_agrees_with_itself():
     found = report()
     assert found.present.determined == np.sum(found.present.singular_values >= 3) == 5
@@ -451,7 +442,6 @@ def test_the_report_agrees_with_itself():
     assert (single in " ".join(str(found).split())) is (together > alone)
 
 
-@pytest.mark.slow
 def test_what_is_proportional_is_known_alike():
     for outlook in (report().present, *report().designs):
         for one, other in (("k_w", "K_w0"), ("c_z", "C_z0")):
@@ -527,7 +517,6 @@ def test_the_report_names_what_it_knows_and_the_fit_does_not():
     assert not other.open_in_fit and "not determined in the fit" not in str(other)
 
 
-@pytest.mark.slow
 def test_a_report_about_a_fit_that_misses_its_data_says_so_first():
     kept = fitted().adequacy
     missing = eqx.tree_at(
@@ -577,7 +566,6 @@ def test_without_newtons_values_are_stated_per_newton_as_in_the_fit():
     assert rows["K_w0"][2] == "1/m" and "per newton of mean force" in " ".join(str(found).split())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, -1])
 def test_of_designs_that_determine_as_much_the_one_with_smaller_errors_is_named(order):
     lengthenings = [
@@ -636,7 +624,6 @@ def test_a_design_without_equilibrium_is_impossible_and_the_rest_goes_on():
     plt.close(figure)
 
 
-@pytest.mark.slow
 def test_a_target_with_a_sigma_only():
     power = np.asarray(jm.expected_spectrum(TRUTH).proportional)
     nu = jm.SpectrumSettings().degrees_of_freedom(SEGMENTS)
@@ -694,7 +681,6 @@ def test_bad_arguments(make, message):
 # --- promises
 
 
-@pytest.mark.slow
 def test_a_design_keeps_its_promise(x64):
     """Force and displacement drawn and fitted together 200 times: the spread is the report's
     prediction."""
@@ -742,7 +728,6 @@ def test_a_design_keeps_its_promise(x64):
         assert 0.95 * low < spread / promised.quantities[name].left < 1.1 * high, name
 
 
-@pytest.mark.slow
 def test_a_joint_fit_reports_the_promised_errors():
     result = fitted()
     promised = next(d for d in jm.identifiability(result).designs if "displacement" in d.name)

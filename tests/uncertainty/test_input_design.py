@@ -104,7 +104,6 @@ def information(lengthening):
     return np.einsum("ki,kj,k->ij", rows.conj(), rows, 1 / variance).real
 
 
-@pytest.mark.slow
 def test_the_information_is_that_of_the_closed_form(x64):
     lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
     assert len(lengthening.frequency) == 295 and lengthening.rms == pytest.approx(1e-3, rel=1e-12)
@@ -117,7 +116,6 @@ def test_the_information_is_that_of_the_closed_form(x64):
     )
 
 
-@pytest.mark.slow
 def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
     """By hand: H also has m_z s², and slopes by m_w; of both ln masses the prior is known, and then
     they are left out."""
@@ -158,7 +156,6 @@ def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
     assert "m_w and m_z fitted in this measurement" in design.told(told)[1]
 
 
-@pytest.mark.slow
 def test_two_moved_records_know_of_the_masses_once():
     """A record twice is one of twice the mean square: the prior of the masses counts once in
     both."""
@@ -176,7 +173,6 @@ def test_two_moved_records_know_of_the_masses_once():
     assert single.singular_values == pytest.approx(pair.singular_values, rel=1e-3, abs=1e-2)
 
 
-@pytest.mark.slow
 def test_what_follows_from_the_spectrum_depends_on_the_masses_too(x64):
     """Slopes of the coefficient of variation and the highest bins by differences; a record of the
     motion measures both."""
@@ -197,7 +193,6 @@ def test_what_follows_from_the_spectrum_depends_on_the_masses_too(x64):
         assert abs(found[0]) > 0
 
 
-@pytest.mark.slow
 def test_a_motion_for_the_stiffness_as_stretched_in_the_hold(x64):
     """It can be asked for although the fit of a hold does not state it; value and slopes by
     hand."""
@@ -243,7 +238,6 @@ def test_a_mass_that_a_moved_record_was_fitted_with_is_known(x64):
     assert "(m_z fitted in this measurement)" in design.told(both)[1]
 
 
-@pytest.mark.slow
 def test_what_a_record_tells_if_the_muscle_is_another_one():
     """The prior of a task is independent of all else: a standard error up multiplies k_w by exp of
     its prior's, no more."""
@@ -303,7 +297,6 @@ def designed(**given):
         return jm.design_input(hold(), **({"seconds": SECONDS, "band": BAND, "rate": 50.0} | given))
 
 
-@pytest.mark.slow
 def test_repeats_scatter_as_said_and_the_designed_motion_beats_the_flat_one():
     """By the law of the ordinates alone: no prior, no fluctuations, noise known."""
     made = designed(band=(0.1, 10.0))
@@ -351,7 +344,6 @@ def experiment(quantity):
         return Experiment.of(hold(), quantity, Lengthening.flat(1e-3, BAND, SECONDS), None)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("quantity", [("K_w0",), ("C_z0",), ("K_w0", "K_z0", "C_w0", "C_z0")])
 def test_the_optimum_obeys_the_equivalence_theorem(quantity):
     """No direction towards any step of the density lowers the variance, and those that are used
@@ -369,7 +361,6 @@ def test_the_optimum_obeys_the_equivalence_theorem(quantity):
     assert here < criterion(made, made.even.power)
 
 
-@pytest.mark.slow
 def test_what_is_reported_is_of_the_motion():
     made = designed()
     spectrum = np.abs(np.fft.rfft(made.displacement)) / made.displacement.size
@@ -385,7 +376,6 @@ def test_what_is_reported_is_of_the_motion():
     assert made.peak / made.rms < 2.0  # random phases: about 3.5
 
 
-@pytest.mark.slow
 def test_limits_are_kept():
     made = designed(quantity="K_z0", peak=1.2e-3, speed=8e-3, rate=1000.0)
     velocity = np.gradient(np.append(made.displacement, made.displacement[0]), 1e-3)
@@ -404,7 +394,6 @@ def test_limits_are_kept():
     assert made.gain > 1.0 and made.even.rms < made.rms
 
 
-@pytest.mark.slow
 def test_the_acceleration_of_a_motor_is_kept():
     free = designed(quantity="K_z0", rate=1000.0)
     most = 0.3 * free.acceleration
@@ -428,7 +417,6 @@ def test_an_even_design_is_the_flat_one():
     ) and "too vague" not in str(made)
 
 
-@pytest.mark.slow
 def test_a_flat_motion_is_drawn_and_called_once(tmp_path):
     for spread, names in ((1.0, {"flat motion"}), (0.0, {"flat motion", "designed motion"})):
         made = designed(spread=spread, error=0.05)
@@ -447,7 +435,6 @@ def test_a_flat_motion_is_drawn_and_called_once(tmp_path):
         )
 
 
-@pytest.mark.slow
 def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
     """A record of twice the length, designed as such, has the errors told for it; at the length
     needed they are as wanted.
@@ -494,7 +481,6 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
         designed(error=-0.1)
 
 
-@pytest.mark.slow
 def test_a_wider_band_is_told_of_where_it_tells_more():
     """As another design says, whose band it is and which is flat."""
     made = designed(band=(0.1, 1.0))
@@ -522,7 +508,6 @@ def test_a_quantity_of_several_targets_has_its_plain_name():
     ]
 
 
-@pytest.mark.slow
 def test_the_same_key_the_same_motion():
     again = jm.design_input(hold(), seconds=SECONDS, band=BAND, rate=50.0, key=jax.random.key(0))
     np.testing.assert_array_equal(again.displacement, designed().displacement)
@@ -530,7 +515,6 @@ def test_the_same_key_the_same_motion():
     assert designed(key=1).stderr == pytest.approx(designed().stderr)
 
 
-@pytest.mark.slow
 def test_a_task_instead_of_a_fit():
     """Its usual parameters are free, and there are no data: the start is the prior."""
     made = jm.design_input(TRUTH, band=BAND, rate=50.0)
@@ -543,7 +527,6 @@ def test_a_task_instead_of_a_fit():
 # --- among the designs of a report
 
 
-@pytest.mark.slow
 def test_the_standard_designs_know_what_a_flat_motion_tells():
     designs = [d for d in jm.standard_designs(hold()) if d.lengthening is not None]
     report = jm.identifiability(hold(), designs=designs)
@@ -563,7 +546,6 @@ def test_the_standard_designs_know_what_a_flat_motion_tells():
     )
 
 
-@pytest.mark.slow
 def test_a_measured_stiffness_with_these_errors_tells_the_same(x64):
     """The likelihood of a fit and the information of a design are one."""
     # As many points, settings and free parameters as in tests/fits/test_perturbed_fit.py: one
@@ -664,7 +646,6 @@ def test_the_figure():
         plt.close(figure)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "message"),
     [

@@ -64,7 +64,6 @@ def chains_of(apart, key=0, draws=500):
         return next(sample(density, jax.random.key(key), 4, (draws,), 400, silent))[0]
 
 
-@pytest.mark.slow
 def test_chains_of_a_normal_density():
     """R-hat of the spread is above 1.01 in one of some ten runs of 500 draws, and in none of
     4000."""
@@ -77,7 +76,6 @@ def test_chains_of_a_normal_density():
     assert verdict(found, {str(i): diagnosed(found.s[:, :, i]) for i in range(3)}, ("0",))[0]
 
 
-@pytest.mark.slow
 def test_chains_that_do_not_mix_are_found_out():
     found = chains_of(40.0, key=1)
     # with other keys all starts may lie on one side
@@ -86,7 +84,6 @@ def test_chains_that_do_not_mix_are_found_out():
     assert not success and "did not mix" in message and "longer chains" in message
 
 
-@pytest.mark.slow
 def test_chains_go_on_where_they_ended():
     with jax.enable_x64(True):
         density = Gaussian(np.zeros(3), np.eye(3), 0.0)
@@ -174,7 +171,6 @@ def test_curvature_profile_and_posterior_agree_where_the_data_determine_all():
         )
 
 
-@pytest.mark.slow
 def test_posterior_as_files_and_figures(tmp_path):
     found = drawn()
     count = found.samples["c_w"].shape[1]
@@ -224,18 +220,15 @@ def short():
     return of_few_draws()
 
 
-@pytest.mark.slow
 def test_the_same_key_gives_the_same_draws():
     np.testing.assert_array_equal(of_few_draws().samples["c_w"], short().samples["c_w"])
 
 
-@pytest.mark.slow
 def test_the_bounds_that_held_are_kept():
     assert short().settings["bounds"] == {"c_w": [1.0, 1e4], "noise_K_z": [1e-5, None]}
     assert drawn().settings["bounds"] == well_known()[1].settings["bounds"]
 
 
-@pytest.mark.slow
 def test_chains_without_a_summary():
     assert not short().success  # 100 correlated draws of a chain count for less than 100
     with pytest.raises(jm.errors.NotMixedError, match="longer chains"):
@@ -277,7 +270,6 @@ def test_what_the_data_leave_open_has_an_open_profile():
     plt.close(corner.plot().figure)
 
 
-@pytest.mark.slow
 def test_density_is_summed_over_the_frequency():
     """Against fine quadrature of the likelihood over the frequency at a point of the other
     coordinates."""
@@ -326,7 +318,6 @@ def test_density_is_summed_over_the_frequency():
         np.testing.assert_allclose(slope, (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.slow
 def test_the_common_scale_is_counted_from_the_coefficient_of_variation():
     """The density of the amplitudes as they are, up to a constant; the coordinate alone moves the
     model's variation."""
@@ -391,7 +382,6 @@ def bare():
     return jm.Target("bare", np.linspace(2, 1, 30))
 
 
-@pytest.mark.slow
 def test_errors():
     result = sloppy()
     with pytest.raises(ValueError, match="neither segments nor sigma"):
@@ -410,7 +400,6 @@ def test_errors():
         jm.profile(result, "m_w")
 
 
-@pytest.mark.slow
 def test_command(tmp_path):
     spectrum = tmp_path / "bare.csv"
     f = np.arange(1, 31) * 0.390625
@@ -458,7 +447,6 @@ def benchmark():
     return module
 
 
-@pytest.mark.slow
 def test_the_calibration_draws_its_muscles_from_the_prior_of_the_fit():
     """The study itself takes hours: `benchmarks/calibration.py`, table in docs/uncertainty.md."""
     study = benchmark()

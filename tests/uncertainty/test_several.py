@@ -56,7 +56,6 @@ def alone(name, free=FREE):
     return jm.fit(TASKS[name], targets()[name], free=free, check_seeds=0, **QUICK)
 
 
-@pytest.mark.slow
 def test_a_joint_fit_of_one_target_is_the_fit_of_that():
     joint = jm.fit_joint({"low": targets()["low"]}, tasks={"low": TASKS["low"]}, free=FREE, **QUICK)
     for name in (
@@ -73,7 +72,6 @@ def test_a_joint_fit_of_one_target_is_the_fit_of_that():
     assert jm.profile(joint, "c_w").intervals == jm.profile(alone("low"), "c_w").intervals
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "separate", [(), ("c_w", "harmonic_amplitude")], ids=["shared", "separate"]
 )
@@ -88,7 +86,6 @@ def test_a_fit_taken_up_again_is_at_the_same_point(x64, separate):
     assert {n: float(c) for n, c in centre.items()} == joint.settings["prior_centre"]
 
 
-@pytest.mark.slow
 def test_proportional_parameters_are_taken_up_with_their_ratio(x64):
     names = (
         "k_w",
@@ -113,7 +110,6 @@ def test_proportional_parameters_are_taken_up_with_their_ratio(x64):
         )
 
 
-@pytest.mark.slow
 def test_the_likelihoods_of_the_targets_add_up(x64):
     joint = both()
     problem = reopened(joint)
@@ -129,7 +125,6 @@ def test_the_likelihoods_of_the_targets_add_up(x64):
     assert float(likelihood.marginal(moments)) == pytest.approx(sum(each), rel=1e-9)
 
 
-@pytest.mark.slow
 def test_information_adds_up(x64):
     """Of what is shared: at the same point, that of both is the sum of that of each."""
     joint = both()
@@ -161,7 +156,6 @@ def test_information_adds_up(x64):
     assert f"low: {held}, P_w = 4 N; high: {held}, P_w = 8 N" in found.present.task
 
 
-@pytest.mark.slow
 def test_a_design_names_the_target_that_it_is_like():
     design = jm.Design("longer", segments=100, target="high")
     assert "P_w = 8 N" in jm.identifiability(both(), designs=[design]).designs[0].task
@@ -264,7 +258,6 @@ def test_the_posterior_of_two_targets(tmp_path, monkeypatch):
     plt.close(found.plot_chains().figure)
 
 
-@pytest.mark.slow
 def test_goodness_of_two_targets():
     """The worse of two spectra is named; that of a joint fit of one target is that of the fit."""
     odd = targets()["high"].proportional_power.copy()

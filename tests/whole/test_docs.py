@@ -148,7 +148,6 @@ def examples(name):
                 yield code
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(FUNCTIONS) - OF_PROCESSES))
 def test_function_has_an_example(name, tmp_path, monkeypatch):
     """Those that need neither a file of the reader's nor a fit are run."""
@@ -212,7 +211,6 @@ def test_every_page_is_in_the_navigation():
     assert set(re.findall(r"[\w/-]+\.md", navigation)) == pages | notebooks
 
 
-@pytest.mark.slow
 def test_every_formula_of_a_page_can_be_typeset():
     """As the site does without the network, in `docs/notebooks.py`; GitHub does it by itself."""
     formulas = module(ROOT / "docs" / "formulas.py")
@@ -246,7 +244,6 @@ def test_parameter_page_is_current():
     )
 
 
-@pytest.mark.slow
 def test_the_picture_of_the_layers_is_current():
     architecture = module(ROOT / "docs" / "architecture.py")
     assert architecture.PICTURE.read_text(encoding="utf-8") == architecture.picture(), (

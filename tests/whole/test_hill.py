@@ -592,7 +592,7 @@ def test_the_page_runs_and_its_fit_finds_the_muscle(monkeypatch):
     """
     monkeypatch.chdir(DOCS.parent)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    linear = {"starts=8)": "starts=8, seeds=0, check_seeds=0)"}
+    linear = {"starts=8\n": "starts=8, seeds=0, check_seeds=0\n"}
     with without_intervals():
         result = pages.run("docs/own-muscle.md", smaller=linear)["result"]
     assert result.success, result.message

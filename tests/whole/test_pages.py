@@ -53,7 +53,7 @@ RUN_HERE = {
 # Data with a rhythm are also tried with a tremor: two more programs of each fit, which
 # fits/test_rungs.py has.
 FEW = "rungs=0, starts=16, seeds=16, check_seeds=16"
-OF_TRIALS = {'"trial3.csv"])  # the trials': f'"trial3.csv"], {FEW})  # the trials'}
+OF_TRIALS = {'"trial3.csv"])\n# without': f'"trial3.csv"], {FEW})\n# without'}
 
 
 def jitted(*functions: str) -> dict[str, str]:
@@ -107,7 +107,7 @@ IN_NOTEBOOKS = {
     },
     "07-your-own-muscle": {
         "starts=16": FEW,
-        '"paper\'s, as printed": jm.Isometric(), ': "",  # the muscle of all other pages
+        '"paper\'s, as printed": jm.Isometric(),': "",  # the muscle of all other pages
         **jitted(
             "jax.vmap(variation, in_axes=(None, 0))",
             "jax.grad(lambda damping:"
@@ -235,31 +235,49 @@ def once():
 
 @pytest.fixture(scope="module")
 def readme(once, tmp_path_factory):
-    """What the README leaves behind, and the page that goes on from it."""
+    """The folder in which the blocks of the README are run, and what they leave behind."""
+    folder = tmp_path_factory.mktemp("readme")
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(tmp_path_factory.mktemp("readme"))
+        patch.chdir(folder)
         write_recordings()
+        return folder, pages.run("README.md", {}, OF_TRIALS)
+
+
+@pytest.fixture(scope="module")
+def in_python(once, readme):
+    """What the README leaves behind, and the page that goes on from it."""
+    folder, names = readme
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
         for seed, name in enumerate("abc"):
             write_spectrum(f"{name}.csv", seed)
         write_plain("plain.toml")
         with contextlib.redirect_stdout(io.StringIO()) as printed:
-            names = pages.run(
-                "docs/python.md", pages.run("README.md", {"printed": printed}, OF_TRIALS), IN_PYTHON
-            )
-    return names | {"returned": dict(once.last)}
+            names = pages.run("docs/python.md", names, IN_PYTHON)
+    return names | {"returned": dict(once.last), "printed": printed}
+
+
+def test_readme(readme):
+    """Every block of Python, on recordings of one person."""
+    _, names = readme
+    mine = names["mine"]
+    assert (
+        names["slope"] != 0
+        and mine.success
+        and abs(mine.parameters["harmonic_frequency"].value - 6.0) < 0.25 * 0.390625
+    )
+    variation = mine.derived["coefficient_of_variation"]
+    # A fourth trial of the same person, known to √3 times the error of the mean of three.
+    (fourth,) = names["recording"].steady().target().coefficient_of_variation
+    assert variation.stderr is not None and abs(variation.value - fourth) < 4 * 2 * variation.stderr
 
 
 @pytest.mark.slow
-def test_readme(readme):
+def test_the_page_for_python(in_python):
     """The programs of the design document, as the README and its page for Python have them."""
-    result, mine, found = readme["result"], readme["mine"], readme["found"]
+    result, found = in_python["result"], in_python["found"]
     assert result.success and result.chi2_per_bin <= 1.3
-    assert mine.success and abs(mine.parameters["harmonic_frequency"].value - 6.0) < 0.25 * 0.390625
-    variation = mine.derived["coefficient_of_variation"]
-    # A fourth trial of the same person, known to √3 times the error of the mean of three.
-    (fourth,) = readme["recording"].steady().target().coefficient_of_variation
-    assert variation.stderr is not None and abs(variation.value - fourth) < 4 * 2 * variation.stderr
-    assert "left out: white" in readme["printed"].getvalue()
+    assert "left out: white" in in_python["printed"].getvalue()
     assert found.divergences <= 6  # of 300; whole chains have none
     summary = found.summary()
     for name, derived in result.derived.items():
@@ -271,16 +289,16 @@ def test_readme(readme):
 
 
 @pytest.mark.slow
-def test_ensembles(readme):
+def test_ensembles(in_python):
     fewer = {"seeds=100_000": "seeds=64", "seeds=5_000": "seeds=48", "seeds=1000": "seeds=32"}
-    pages.run("docs/ensembles.md", readme, fewer)
+    pages.run("docs/ensembles.md", in_python, fewer)
     assert Path("runs.zarr").exists() and Path("persons.zarr").exists()
 
 
 @pytest.mark.slow
-def test_uncertainty(readme):
+def test_uncertainty(in_python):
     # the same draws, which take a minute
-    assert pages.run("docs/uncertainty.md")["found"] is readme["found"]
+    assert pages.run("docs/uncertainty.md")["found"] is in_python["found"]
     assert Path("posterior.nc").exists()
 
 
@@ -345,7 +363,7 @@ def test_own_data():
     quick = {
         "jm.task_for(tremor), tremor": f"jm.on_rung(jm.task_for(tremor), 2), tremor, {few}",
         "held.target())\n": f"held.target(), {FEW})\n",
-        "target)  # the same": f"target, {FEW})  # the same",
+        "fit(jm.Isometric(), target)": f"fit(jm.Isometric(), target, {FEW})",
     }
     names = pages.run("docs/recordings.md", {}, quick)
     assert names["result"].success and names["moving"].task.quantity == "acceleration"
@@ -489,7 +507,7 @@ def unlabelled(figure):
 
 
 @pytest.mark.slow
-def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(readme, monkeypatch):
+def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(in_python, monkeypatch):
     """The statements of the README's results are those of the gallery: what takes minutes is not
     done twice."""
     for name in (
@@ -501,7 +519,7 @@ def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(readme, m
         "design_input",
         "sensitivity",
     ):
-        monkeypatch.setattr(jm, name, lambda *_, found=readme["returned"][name], **__: found)
+        monkeypatch.setattr(jm, name, lambda *_, found=in_python["returned"][name], **__: found)
     smaller = {
         "seeds=200)": "seeds=100)",
         "seeds=2000": "seeds=100",
@@ -516,7 +534,7 @@ def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(readme, m
         assert any(old in section.setup for section in GALLERY.SECTIONS), (
             f"the gallery says no longer {old}"
         )
-    names, few = dict(readme), FEW.replace("starts=16", "starts=4")
+    names, few = dict(in_python), FEW.replace("starts=16", "starts=4")
     # the paper's figures and a study, which fits/test_study.py does
     for section in GALLERY.SECTIONS[:-2]:
         exec(
