@@ -70,7 +70,7 @@ IN_PYTHON = {
     "seeds=100_000": "seeds=100",
     "seeds=1000)": "seeds=100)",
     # as docs/ensembles.md has it
-    "summary = jm.ensemble(result.task": "summary = jm.ensemble(jm.Isometric()",
+    "summary = jm.ensemble(\n    result.task": "summary = jm.ensemble(\n    jm.Isometric()",
     "jm.identifiability(result)": f"jm.identifiability({PLAIN_FIT})",
     "jm.design_input(result,": f"jm.design_input({PLAIN_FIT},",
 } | jitted(
@@ -108,11 +108,9 @@ IN_NOTEBOOKS = {
     "07-your-own-muscle": {
         "starts=16": FEW,
         '"paper\'s, as printed": jm.Isometric(),': "",  # the muscle of all other pages
-        **jitted(
-            "jax.vmap(variation, in_axes=(None, 0))",
-            "jax.grad(lambda damping:"
-            " jm.expected_spectrum(mine.replace(damping=damping)).proportional[0])",
-        ),
+        **jitted("jax.vmap(variation, in_axes=(None, 0))"),
+        "slope = jax.grad(": "slope = jax.jit(jax.grad(",
+        ")(60.0)": "))(60.0)",
     },
     "08-perturb-and-measure": {
         "rungs=0, check_seeds=0": "rungs=0, check_seeds=0, starts=8",
