@@ -1,12 +1,17 @@
-"""How often 95 % intervals hold the truth, in recordings made by NumPy from a known spectrum,
-without the model.
+"""How often 95 % intervals hold the truth, and how often a tremor is found, in recordings made by
+NumPy from a known spectrum, without the model.
 
     python benchmarks/intervals.py steadiness [--count N]
+    python benchmarks/intervals.py tremor [--count N]
 
 `steadiness` looks at the intervals of `jm.steadiness`. The spectrum relaxes from a corner of 0.5, 1
 or 2 Hz on, and has a floor; half of the recordings have a tremor at 9 Hz. Others have a level that
 wanders: 1/f^1.5, with periods up to eight recordings long. Takes ten minutes; the outcome stands in
 docs/recordings.md.
+
+`tremor` looks at the test for a tremor: 1/f with a bend at 1, 1.8 or 4 Hz, a floor, an amplitude
+that swells and fades in half of the recordings, and a hill between 8 and 10.5 Hz. Takes a few
+minutes; the outcome stands in docs/force.md.
 """
 
 import functools
@@ -108,10 +113,8 @@ def count_held(signals: np.ndarray, tremor: bool, held: Counts) -> None:
     truth = {name: np.mean([one[name].value for one in each]) for name in each[0].measures} | {
         "mean": MEAN
     }
-    spectra = np.concatenate(
-        [_steadiness._segments(recording.filtered()) for recording in recordings]
-    )
-    truth["peak_frequency"] = _steadiness._hill(spectra.mean(axis=0), 0.0) if tremor else math.nan
+    truth["tremor_frequency"] = 9.0 if tremor else math.nan
+    truth["tremor_size"] = math.nan  # `tremor` below looks at it
     for trials in TRIALS:
         for i in range(0, len(recordings) - trials + 1, trials):
             found = each[i] if trials == 1 else jm.steadiness(recordings[i : i + trials])
@@ -125,7 +128,55 @@ def count_held(signals: np.ndarray, tremor: bool, held: Counts) -> None:
                     held[name][trials].append((bool(inside[0]), bool(inside[1])))
 
 
-STUDIES = {"steadiness": steadiness}
+TRIED = ((15.0, 1), (15.0, 3), (30.0, 1), (30.0, 5))  # seconds, trials
+BENDS = (1.0, 1.8, 4.0)  # Hz
+WIDTH = 1.5  # Hz, of the hill at half height
+
+
+def trembling(
+    rng: np.random.Generator, seconds: float, trials: int, share: float, kind: int
+) -> tuple[list[jm.Recording], float, float]:
+    """Trials of one person; the frequency of the tremor, and the deviation that it has within its
+    width to either side over the mean."""
+    n, at = round(4 * seconds * RATE), rng.uniform(8.0, 10.5)
+    f = np.fft.rfftfreq(n, 1 / RATE)[1:]
+    slow = 1 / np.hypot(f, 0.1) / (1 + (f / BENDS[kind % 3]) ** 2) ** 1.25
+    floor, hill = 1 / (1 + (f / 15) ** 4), np.exp(-4 * np.log(2) * ((f - at) / WIDTH) ** 2)
+    power = (0.97 - share) * slow / slow.sum() + 0.03 * floor / floor.sum()
+    power += share * hill / hill.sum()
+    z = rng.standard_normal((trials, f.size)) + 1j * rng.standard_normal((trials, f.size))
+    z = np.column_stack([np.zeros(trials), z * np.sqrt(power / power.sum())])
+    x = (np.fft.irfft(z, n) * n / 2)[:, : round(seconds * RATE)]
+    if kind >= 3:  # it swells and fades
+        time = np.arange(x.shape[1]) / RATE
+        x *= 1 + 0.5 * np.sin(2 * np.pi * (time / 8 + rng.uniform(size=(trials, 1))))
+    size = DEVIATION / MEAN * math.sqrt(share * (9 / 8 if kind >= 3 else 1))
+    names = [f"trial {i}" for i in range(trials)]
+    made = [jm.Recording(MEAN + DEVIATION * y, RATE, name=n) for y, n in zip(x, names, strict=True)]
+    return made, at, size
+
+
+def tremor(count: int) -> None:
+    """How often a tremor is found, and how often its intervals hold the truth."""
+    constant = {"regularity": lambda x: (1.0, 1.0), "dfa": lambda x: 1.0}  # they take long
+    with mock.patch.multiple(_steadiness, **constant):
+        for (seconds, trials), share in itertools.product(TRIED, (0.0, 0.02, 0.05, 0.1)):
+            rng, held, found = np.random.default_rng(7), [], 0
+            for i in range(count):
+                made, at, size = trembling(rng, seconds, trials, share, i % 6)
+                one = jm.steadiness(made)
+                if (frequency := one["tremor_frequency"]).interval is not None:
+                    found += 1
+                    ends = frequency.interval, one["tremor_size"].interval
+                    held.append([e[0] <= v <= e[1] for e, v in zip(ends, (at, size), strict=True)])
+            said = f"{trials} x {seconds:g} s, {share:.0%}: found {found} of {count}"
+            if share:
+                frequency, size = 100 * np.mean(held, axis=0)
+                said += f"; intervals hold frequency {frequency:.0f} %, size {size:.0f} %"
+            print(said, flush=True)
+
+
+STUDIES = {"steadiness": steadiness, "tremor": tremor}
 
 if __name__ == "__main__":
     run(STUDIES, __doc__, 120)

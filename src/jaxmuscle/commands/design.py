@@ -8,7 +8,7 @@ import typer
 import jaxmuscle as jm
 
 from .console import out, plain, record, reporting, writable
-from .options import Force, Formats, Json, Output, Seed, formats_of, names_in
+from .options import Force, Formats, Json, Output, Seed, band_of, formats_of, names_in
 
 
 def design(
@@ -121,7 +121,7 @@ def design(
             _source(source),
             names_in(quantity, "--quantity") or (),
             rms=rms / 1e3,
-            band=_band(band),
+            band=band_of(band),
             seconds=seconds,
             rate=rate,
             peak=None if peak is None else peak / 1e3,
@@ -197,14 +197,4 @@ def _lengths(text: str | None) -> list[float]:
     except ValueError:
         raise ValueError(
             f"--durations {text}: give lengths of the record in s, as --durations 30,60,120"
-        ) from None
-
-
-def _band(text: str) -> tuple[float, float]:
-    low, _, high = text.partition(":")
-    try:
-        return float(low), float(high)
-    except ValueError:
-        raise ValueError(
-            f"--band {text}: give lowest and highest frequency in Hz, as --band 0.5:5"
         ) from None

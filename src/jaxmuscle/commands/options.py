@@ -333,3 +333,13 @@ def fixed_values(pairs: list[str] | None) -> dict[str, float]:
             raise ValueError(f"--fix {pair!r}: {name.strip()} is fixed twice; give one value")
         fixed[name.strip()] = number
     return fixed
+
+
+def band_of(text: str) -> tuple[float, float]:
+    low, _, high = text.partition(":")
+    try:
+        return float(low), float(high)
+    except ValueError:
+        raise ValueError(
+            f"--band {text}: give lowest and highest frequency in Hz, as --band 0.5:5"
+        ) from None

@@ -1,12 +1,14 @@
 """`jaxmuscle steadiness`."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 import jaxmuscle as jm
 
 from .console import out, plain, record, reporting, writable
-from .options import Force, Formats, Json, Output, Recordings, Window, formats_of
+from .options import Force, Formats, Json, Output, Recordings, Window, band_of, formats_of
 from .recordings import read_trials, reads_recordings
 
 
@@ -15,6 +17,16 @@ def steadiness(
     paths: Recordings,
     *,
     window: Window = None,
+    band: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOW:HIGH",
+            help=(
+                "Frequencies [Hz] between which a tremor is looked for. By default 6:12; of a"
+                " displacement or an acceleration 3:20."
+            ),
+        ),
+    ] = None,
     output: Output = Path("out"),
     formats: Formats = None,
     force: Force = False,
@@ -37,7 +49,8 @@ def steadiness(
         from jaxmuscle._common.files import write_text
 
         writable(output, "steadiness.json", force=force)
-        found = jm.steadiness(read_trials(paths, reading, window))
+        searched = None if band is None else band_of(band)
+        found = jm.steadiness(read_trials(paths, reading, window), band=searched)
         found.save(output / "steadiness.json")
         table = found.to_dataframe().to_csv(index=False, float_format="%.8g", lineterminator="\n")
         write_text(output / "steadiness.csv", table)

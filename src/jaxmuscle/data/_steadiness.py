@@ -15,14 +15,15 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.tables import frame
-from jaxmuscle._common.text import choices, folded, rounded, squared
+from jaxmuscle._common.text import choices, folded, probability, rounded, squared
 from jaxmuscle.spectra._bin_law import ENOUGH
 from jaxmuscle.spectra._fluctuations import BANDS, dfa, variance_spectrum
 from jaxmuscle.spectra._measures import regularity
-from jaxmuscle.spectra._settings import require
+from jaxmuscle.spectra._peak_test import bins_around, find_peaks, measure_peak
+from jaxmuscle.spectra._settings import SpectrumSettings, require
 
 from ._measure import Measure, likelier_error, log_interval, logit_interval, student_interval
-from ._recording import RECORDED, SEGMENTS, SHORTEST, Recording, notices_of, unlike
+from ._recording import AS_RECORDED, RECORDED, SEGMENTS, SHORTEST, Recording, notices_of, unlike
 
 if TYPE_CHECKING:
     import pandas
@@ -32,7 +33,10 @@ if TYPE_CHECKING:
 ALL = "all"
 PARTS, SLOWEST = 4, 4  # parts of a recording; ordinates that say how sure its mean is
 ALIKE = 1.2  # longest trial over shortest
-TREMOR, RISE, HALF = 6.0, 4.0, 3  # Hz; standard deviations of a bin; bins on either side
+# Hz, where a tremor is looked for; what moves shows it over a wider band than a held force
+TREMOR_BANDS = {"displacement": (3.0, 20.0), "acceleration": (3.0, 20.0)}
+TREMOR_BAND = (6.0, 12.0)
+LEVEL = 0.01  # of the test for a tremor
 RANGES = {name.removeprefix("band"): edges for name, edges in BANDS.items()} | {
     "_above_12": (12.0, math.inf)
 }
@@ -50,11 +54,17 @@ WORDS = {
     "approximate_entropy": "approximate entropy",
     "sample_entropy": "sample entropy",
     "dfa_exponent": "DFA exponent",
-    "peak_frequency": "peak between 6 and 12 Hz",
+}
+TREMOR = {
+    "tremor_p": "tremor, {:g} to {:g} Hz",
+    "tremor_frequency": "  frequency",
+    "tremor_size": "  size{}",
+    "tremor_detectable": "  size that would show",
 }
 PEAK = (
-    "A peak, the sign of a tremor, is stated if the mean spectrum rises clearly above its scatter"
-    " there. Of recordings without a tremor at most 4 % show one."
+    "A tremor is stated if the spectrum has a peak that at most 1 in 100 smooth spectra would show"
+    " by chance (p <= 0.01). A tremor of the size that would show is seen in nine of ten such"
+    " recordings; a smaller one may be there unseen."
 )
 
 
@@ -63,8 +73,8 @@ class Steadiness(Printed, Result, eqx.Module):
     `Measure`.
 
     `measures` of all trials together, by name; `trials`, the measures of each by its name, and
-    their `durations` [s]; the `unit` and `quantity` of the signal; `notices`, sentences on what was
-    done and what to mind.
+    their `durations` [s]; the `unit` and `quantity` of the signal; the `band` [Hz] in which a
+    tremor was looked for; `notices`, sentences on what was done and what to mind.
     """
 
     measures: dict[str, Measure]
@@ -72,6 +82,7 @@ class Steadiness(Printed, Result, eqx.Module):
     durations: dict[str, float]
     unit: str
     quantity: str | None
+    band: tuple[float, float]
     notices: tuple[str, ...]
 
     def __getitem__(self, name: str) -> Measure:
@@ -87,6 +98,7 @@ class Steadiness(Printed, Result, eqx.Module):
         return {
             "unit": self.unit,
             "quantity": self.quantity,
+            "tremor_band_hz": list(self.band),
             "measures": _plain(self.measures),
             "trials": each,
             "notices": list(self.notices),
@@ -139,11 +151,23 @@ class Steadiness(Printed, Result, eqx.Module):
                 head,
                 columns,
                 *lines,
+                *self._tremor(),
                 _of_errors(count),
                 PEAK,
                 *(f"notice: {notice}" for notice in self.notices),
             ]
         )
+
+    def _tremor(self) -> list[str]:
+        """Whether there is one; its frequency and size; the size that would have shown."""
+        p, seen = self.measures["tremor_p"].value, self.measures["tremor_size"]
+        first = TREMOR["tremor_p"].format(*self.band)
+        here = math.isfinite(seen.value)
+        lines = [f"{first:<28}{'seen' if here else 'none seen'}, {probability(p)}"]
+        of = " over the mean" * (self.measures["tremor_detectable"].unit == "1")
+        for name in list(TREMOR)[1 if here else 3 :]:
+            lines.append(_line(TREMOR[name].format(of), name, self.measures[name]))
+        return lines
 
 
 def _of_errors(count: int) -> str:
@@ -151,8 +175,9 @@ def _of_errors(count: int) -> str:
     if count < ENOUGH:
         return (
             f"± is the standard error. It is estimated within {'the' if count == 1 else 'each'}"
-            " recording: for entropies and DFA from its four parts, for the peak from its Welch"
-            " segments, for all else from its spectrum."
+            " recording: for entropies and DFA from its four parts, for the tremor from its Welch"
+            " segments, for all else from its spectrum. So it does not say how the next recording"
+            " differs: between trials of one person we saw about twice as much."
         )
     return (
         f"± is the standard error, from the scatter between the {count} trials. A fit states larger"
@@ -171,21 +196,23 @@ def _range(low: float, high: float) -> str:
 
 def _line(words: str, name: str, m: Measure) -> str:
     """The ends of the interval have as many places as value and error."""
-    percent = name.startswith((VARIATION, "share"))
+    percent = name.startswith((VARIATION, "share")) or (name in TREMOR and m.unit == "1")
     bare = m.unit == "1" or name.startswith("power")
     scale, unit = (
         (100.0, " %") if percent else (1.0, "" if bare else f" {m.unit.replace('^2', '²')}")
     )
     said, ends = f"{scale * m.value:.3g}{unit}", ""
     if math.isnan(m.value):
-        said = "no sharp one" if name == "peak_frequency" else "none"
+        said = "none"
     if m.stderr is not None and m.interval is not None:
         said = " ± ".join(rounded(scale * m.value, scale * m.stderr)) + unit
         ends = " to ".join(rounded(scale * end, scale * m.stderr)[0] for end in m.interval)
     return f"{words:<28}{said:<25} {ends}".rstrip()
 
 
-def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
+def steadiness(
+    recordings: Recording | Iterable[Recording], *, band: tuple[float, float] | None = None
+) -> Steadiness:
     """How steady a force, torque or displacement is held: variability, power by band, regularity.
     No model is fitted.
 
@@ -204,23 +231,25 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     | `share_0_0.5` ... | the same over σ², a fraction |
     | `approximate_entropy`, `sample_entropy` | of templates of 2 samples, within 0.2 σ |
     | `dfa_exponent` | slope of detrended fluctuations, windows from 0.04 s to a tenth of the recording, order 1 |
-    | `peak_frequency` | of the highest hill from 6 to 12 Hz [Hz]; NaN if there is none |
+    | `tremor_p` | how often a smooth spectrum shows a peak in the band as clear as the clearest one here |
+    | `tremor_frequency` | of that peak, if p is at most 0.01 [Hz]; else NaN |
+    | `tremor_size` | √(power of the peak) / abs(μ), a fraction; where there is no variation √power [unit] |
+    | `tremor_detectable` | the size, in the same unit, that nine of ten such recordings would show |
 
     **Power by band** is the sum of `jaxmuscle.spectra.variance_spectrum` over low ≤ f < high. It
     takes the whole window, of length T, at once, resolves 1/(2T), and loses nothing: the seven
     powers add up to σ². A drift is in the lowest band. The shares of a fit (`band_0_0.5`) are of
     the 30 bins from 0.39 to 11.72 Hz only, and so are larger above 0.5 Hz.
 
-    **The peak** is a local maximum of the Welch spectrum (2.56 s, bins of 0.39 Hz), the vertex of
-    the parabola through the log power of its seven nearest bins. It counts if its log power stands
-    4/√segments above the higher of the valleys beside it. Of simulated recordings without a peak,
-    up to 4 % then show one. The peak of several trials is that of their mean spectrum.
+    **The tremor** is the clearest peak of the Welch spectrum (2.56 s, bins of 0.39 Hz) in `band`,
+    tested against smooth spectra, see `jaxmuscle.spectra.find_peaks`. That of several trials is of
+    their mean spectrum.
 
     **Several trials** count alike: any other value is the mean of the trials' values.
 
     **Standard errors**, by the number of trials:
 
-    - Three or more, "trials": the standard deviation between the trials over √n; of the peak, the
+    - Three or more, "trials": the standard deviation between the trials over √n; of the tremor, the
       jackknife over trials. A fit takes the larger of this scatter and of what trials of this
       length scatter by chance: five may happen to agree.
     - One or two, "spectrum": the ordinates of the spectrum are taken as independent, the variance
@@ -228,7 +257,7 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
       slowest. What is slower than the recording is not in it: where the level wanders, the mean of
       the next trial differs by more.
     - One or two, "parts" (entropies, DFA exponent): the standard deviation of the values of the
-      four quarters over 2; "segments" (peak): the jackknife over Welch segments.
+      four quarters over 2; "segments" (tremor): the jackknife over Welch segments.
 
     **95 % intervals**, value ± t errors, with Student's t of ν degrees of freedom, cut where no
     value can lie (below 0; of a share above 1): "trials" ν = n - 1; "parts" 3n; "segments" their
@@ -237,7 +266,9 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     from the "spectrum": value · exp(± 1.96 error / value); of a share p the same of its odds p /
     (1 - p). How often they hold the expected value stands in `docs/recordings.md`.
 
-    **Arguments:** `recordings`, one or several trials of one condition of one person, in one unit.
+    **Arguments:** `recordings`, one or several trials of one condition of one person, in one unit;
+    `band` (low, high) [Hz] in which a tremor is looked for, by default 6 to 12 Hz in a force, 3 to
+    20 Hz in a displacement or an acceleration.
 
     **Returns:** a `Steadiness`; it prints, plots and saves itself.
 
@@ -264,19 +295,17 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     ]
     durations = {name: recording.duration for name, recording in zip(names, each, strict=True)}
     signals = [recording.filtered() for recording in each]
-    segments = [_segments(x) for x in signals]
+    usual = TREMOR_BANDS.get(each[0].quantity or "", TREMOR_BAND)
+    band = usual if band is None else (float(band[0]), float(band[1]))
+    settings = _settings_around(band)
+    segments = [_segments(x, settings) for x in signals]
     own = [_own(x, each[0].unit) for x in signals]
     trials = {
-        name: _stated(m | {"peak_frequency": _peak([*s[:, None]], "segments")}, 1, len(s))
+        name: _stated(m | _tremor([s], settings, band, m), 1, len(s))
         for name, m, s in zip(names, own, segments, strict=True)
     }
-    many = len(each) >= ENOUGH
-    peak = _peak(
-        segments if many else [*np.concatenate(segments)[:, None]], "trials" if many else "segments"
-    )
-    together = {name: _together([m[name] for m in own]) for name in own[0]} | {
-        "peak_frequency": peak
-    }
+    together = {name: _together([m[name] for m in own]) for name in own[0]}
+    together |= _tremor(segments, settings, band, together)
     together = _stated(together, len(each), sum(map(len, segments)))
     said = notices_of(each, signals, float(RECORDED.rate), [()] * len(each), each[0].quantity)
     if (
@@ -289,7 +318,8 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
             "the errors do not contain how much two trials differ: for that give three or more",
         )
     notices = (*said, *_mind(durations, together, own))
-    return Steadiness(together, trials, durations, each[0].unit, each[0].quantity, notices)
+    unit, quantity = each[0].unit, each[0].quantity
+    return Steadiness(together, trials, durations, unit, quantity, band, notices)
 
 
 def _same_unit(each: list[Recording]) -> None:
@@ -424,36 +454,51 @@ def _together(each: list[Measure]) -> Measure:
     return _measure(float(np.mean(values)), error, first.unit, first.error_from)
 
 
-def _segments(x: Float[np.ndarray, " times"]) -> Float[np.ndarray, "segments bins"]:
+def _settings_around(band: tuple[float, float]) -> SpectrumSettings:
+    """Those of recordings, with the bins that say what is smooth about a band."""
+    first, last = bins_around(band, RECORDED)
+    return SpectrumSettings(**AS_RECORDED, first_bin=first, last_bin=last)
+
+
+def _segments(
+    x: Float[np.ndarray, " times"], settings: SpectrumSettings = RECORDED
+) -> Float[np.ndarray, "segments bins"]:
     """The spectrum of every Welch segment."""
-    length, bins = RECORDED.length, slice(RECORDED.first_bin, RECORDED.last_bin + 1)
-    return scipy.signal.spectrogram(x, RECORDED.rate, "hann", length, length - RECORDED.step)[2].T[
-        :, bins
-    ]
+    length, bins = settings.length, slice(settings.first_bin, settings.last_bin + 1)
+    _, _, power = scipy.signal.spectrogram(x, settings.rate, "hann", length, length - settings.step)
+    return power.T[:, bins]
 
 
-def _peak(groups: list[np.ndarray], error_from: str) -> Measure:
-    """The hill of the mean of all segments; its error by leaving out one group of them after
-    another."""
-    whole, count = np.concatenate(groups), len(groups)
-    value = _hill(np.mean(whole, axis=0), RISE / math.sqrt(len(whole)))
-    left_out = [
-        _hill(np.mean(np.concatenate(groups[:i] + groups[i + 1 :]), axis=0), 0.0)
-        for i in range(count)
-    ]
-    return _measure(value, math.sqrt((count - 1) * float(np.var(left_out))), "Hz", error_from)
+def _tremor(
+    segments: list[Float[np.ndarray, "_ bins"]],  # of each trial
+    settings: SpectrumSettings,
+    band: tuple[float, float],
+    measures: dict[str, Measure],
+) -> dict[str, Measure]:
+    """The clearest peak of the mean of all segments; its errors by leaving out one trial after
+    another, or of few trials one segment."""
+    counts, whole = tuple(map(len, segments)), np.concatenate(segments)
+    many = len(segments) >= ENOUGH
+    groups, error_from = (segments, "trials") if many else ([*whole[:, None]], "segments")
+    mean, varies = measures["mean"], math.isfinite(measures[VARIATION].value)
+    scale, unit = (1 / abs(mean.value), "1") if varies else (1.0, mean.unit)
 
+    def measured(power: Float[np.ndarray, " bins"]) -> tuple[float, float]:
+        frequency, excess = measure_peak(power, settings, counts, band)
+        return frequency, scale * math.sqrt(excess)
 
-def _hill(power: Float[np.ndarray, " bins"], rise: float) -> float:
-    """Frequency of the most prominent maximum of log power above 6 Hz; NaN if none rises so
-    much."""
-    f, logged = RECORDED.frequency, np.log(power)
-    tops, seen = scipy.signal.find_peaks(logged, prominence=rise)
-    fast = f[tops] >= TREMOR
-    if not np.any(fast):
-        return math.nan
-    top = tops[fast][np.argmax(seen["prominences"][fast])]
-    near = slice(max(top - HALF, 0), top + HALF + 1)
-    bend, slope, _ = np.polyfit(f[near] - f[top], logged[near], 2)
-    reach = HALF * RECORDED.resolution
-    return float(f[top] + (np.clip(-slope / (2 * bend), -reach, reach) if bend < 0 else 0.0))
+    found = find_peaks(np.mean(whole, axis=0), settings, counts, band, LEVEL)
+    values, errors = (math.nan, math.nan), (math.nan, math.nan)
+    if found.peaks:
+        values = measured(np.mean(whole, axis=0))
+        left_out = [
+            measured(np.mean(np.concatenate(groups[:i] + groups[i + 1 :]), axis=0))
+            for i in range(len(groups))
+        ]
+        errors = np.sqrt((len(groups) - 1) * np.var(left_out, axis=0))
+    return {
+        "tremor_p": Measure(found.p, None, "1", error_from),
+        "tremor_frequency": _measure(values[0], float(errors[0]), "Hz", error_from),
+        "tremor_size": _measure(values[1], float(errors[1]), unit, error_from),
+        "tremor_detectable": Measure(scale * math.sqrt(found.detectable), None, unit, error_from),
+    }

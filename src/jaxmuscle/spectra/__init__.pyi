@@ -10,6 +10,9 @@ from ._measures import peaks as peaks
 from ._measures import sample_entropy as sample_entropy
 from ._measures import signal_to_noise as signal_to_noise
 from ._measures import spearman as spearman
+from ._peak_test import Peak as Peak
+from ._peak_test import PeakTest as PeakTest
+from ._peak_test import find_peaks as find_peaks
 from ._settings import SpectrumSettings as SpectrumSettings
 from ._welch import Spectrum as Spectrum
 from ._welch import lowpass as lowpass
