@@ -490,6 +490,25 @@ def test_two_writers_never_give_wrong_numbers(tmp_path, monkeypatch):
         assert kills.equal(found, ones[key], True, 0.0)
 
 
+@pytest.mark.parametrize("kept", [{"reduce": True}, {}], ids=["reduced", "trajectories"])
+def test_a_store_is_read_before_others_may_write_it(tmp_path, monkeypatch, kept):
+    """A process that overwrites it could come in between: the first would find nothing, or an empty
+    store."""
+    locked = []
+
+    def noting(call):
+        def noted(*given, **more):
+            locked.append((tmp_path / ".a.zarr.lock").exists())
+            return call(*given, **more)
+
+        return noted
+
+    monkeypatch.setattr(_ensemble_run, "_loaded", noting(_ensemble_run._loaded))
+    monkeypatch.setattr(xarray, "open_zarr", noting(xarray.open_zarr))
+    made(tmp_path / "a.zarr", kept)
+    assert locked == [True] and not (tmp_path / ".a.zarr.lock").exists()
+
+
 def test_a_store_may_be_copied(tmp_path):
     given = made(tmp_path / "a.zarr", {}, seeds=8)
     shutil.copytree(tmp_path / "a.zarr", tmp_path / "b.zarr")

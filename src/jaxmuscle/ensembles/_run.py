@@ -98,7 +98,8 @@ def reduced(
         if left:
             _reduce_all(layout, levels, place, tell, nothing)
             _finished(layout, place)
-    return _loaded(place, blank)
+        # Before the lock is given back: whoever overwrites the store could come in between.
+        return _loaded(place, blank)
 
 
 def _finished(layout: Layout, place: AbstractPlace) -> None:
@@ -339,7 +340,7 @@ def stored(
             return _report(layout, part, failed, complete=not left)
         if left:
             _finished(layout, place)
-    return xarray.open_zarr(place.opened())
+        return xarray.open_zarr(place.opened())
 
 
 def _write_chunks(
