@@ -54,8 +54,8 @@ def smooth(corner):
 
 @pytest.mark.parametrize("corner", [1.0, 1.8, 4.0])
 def test_smooth_spectra_show_a_peak_as_often_as_the_level_says(corner):
-    """Of 300 at most 8 at 1 % and between 30 and 65 at 15 %: by chance alone beyond these once in
-    100 and once in 400. The seeds are fixed."""
+    """Of 300 at most 8 at 1 % and between 30 and 65 at 15 %: beyond these by chance alone once in
+    260 and once in 170."""
     p = np.array([found.p for found in smooth(corner)])
     assert np.sum(p <= 0.01) <= 8 and 30 <= np.sum(p <= 0.15) <= 65
     assert all((len(found.peaks) > 0) == (found.p <= 0.01) for found in smooth(corner))
