@@ -248,6 +248,19 @@ def test_a_coefficient_of_variation_adds_its_gaussian_density():
         ) == pytest.approx(density, rel=1e-6)
 
 
+def test_a_dynamic_stiffness_adds_the_gaussian_density_of_its_parts(x64):
+    """Real and imaginary part are independent, each of the standard deviation that is stated."""
+    f, task = np.array([0.5, 1.0, 2.0, 5.0]), jm.PrescribedLength()
+    true = np.asarray(jm.response.dynamic_stiffness(task, f))
+    sd = np.array([0.02, 0.05, 0.1, 0.03]) * np.abs(true)
+    measured = true + sd * np.array([1.0 - 0.5j, -2.0 + 1.5j, 0.3j, 0.7])
+    figure = jm.FrequencyResponse(f, measured, sd)
+    density = scipy.stats.norm.logpdf([(measured - true).real, (measured - true).imag], scale=sd)
+    expected = density.sum() + f.size * np.log(2 * np.pi)
+    found = jm.log_likelihood(task, jm.Target("figure", None, stiffness=figure))
+    assert float(found) == pytest.approx(expected, rel=1e-9)
+
+
 def test_whittle_is_the_law_of_a_periodogram():
     """With a line: scipy's noncentral chi-squared density of 2 I / N with noncentrality 2 L / N."""
     data = recording()
