@@ -332,6 +332,20 @@ def test_a_mean_near_zero_has_no_variation():
     assert "near zero" in about.notices[-1] and "coefficient of variation    none" in str(about)
 
 
+def test_a_level_that_wanders_is_noticed():
+    """An F test at 5 %: of 40 steady recordings more than 7 are noticed once in 1400. A random
+    walk's ordinates fall as 1/k², by a factor of 40 from the first four to the next eight: more
+    than half of them are noticed."""
+    walks = np.cumsum(np.random.default_rng(8).standard_normal((20, 1500)), axis=1) / 300 + LEVEL
+    said = [
+        any("level wanders" in n for n in _steadiness._wandering([x]))
+        for x in (*forces(40, 15.0, tremor=0, seed=9), *walks)
+    ]
+    assert sum(said[:40]) <= 7 and sum(said[40:]) >= 15
+    (notice,) = _steadiness._wandering([walks[int(np.flatnonzero(said[40:])[0])]])
+    assert notice in jm.steadiness(jm.Recording(walks[np.flatnonzero(said[40:])[0]], RATE)).notices
+
+
 def test_trials_of_different_length_are_noticed():
     long, short = (
         jm.Recording(forces(3, 15.0)[0], RATE),

@@ -37,6 +37,7 @@ ALIKE = 1.2  # longest trial over shortest
 TREMOR_BANDS = {"displacement": (3.0, 20.0), "acceleration": (3.0, 20.0)}
 TREMOR_BAND = (6.0, 12.0)
 LEVEL = 0.01  # of the test for a tremor
+NEXT, WANDERS = 12, 0.05  # ordinates; level of the test whether the slowest of them stand out
 RANGES = {name.removeprefix("band"): edges for name, edges in BANDS.items()} | {
     "_above_12": (12.0, math.inf)
 }
@@ -317,9 +318,30 @@ def steadiness(
             *said,
             "the errors do not contain how much two trials differ: for that give three or more",
         )
+    if len(each) < ENOUGH:
+        said = (*said, *_wandering(signals))
     notices = (*said, *_mind(durations, together, own))
     unit, quantity = each[0].unit, each[0].quantity
     return Steadiness(together, trials, durations, unit, quantity, band, notices)
+
+
+def _wandering(signals: list[np.ndarray]) -> tuple[str, ...]:
+    """What to say where the spectrum still rises towards the slowest ordinates, which say how sure
+    the mean is.
+
+    If it is flat there, each ordinate is s χ²(1), and the ratio of the mean of the first 4 to that
+    of the next 8, of n recordings together, has an F distribution of 4n and 8n degrees of freedom.
+    """
+    power = np.mean([variance_spectrum(x, 1.0)[1][:NEXT] for x in signals], axis=0)
+    ratio = float(np.mean(power[:SLOWEST]) / np.mean(power[SLOWEST:]))
+    count = len(signals)
+    if scipy.special.fdtrc(SLOWEST * count, (NEXT - SLOWEST) * count, ratio) > WANDERS:
+        return ()
+    return (
+        f"the level wanders: the slowest fluctuations have {ratio:.2g} times the power of the next"
+        " ones. Then the mean of another recording may differ by more than the interval of the mean"
+        " says. Three trials or more show by how much",
+    )
 
 
 def _same_unit(each: list[Recording]) -> None:
