@@ -109,6 +109,7 @@ def result(minute):
     return jm.fit(jm.PrescribedLength(), minute)
 
 
+@pytest.mark.slow
 def test_stiffness_and_damping_are_known(result):
     """The issue's bounds: within three stated errors, which are at most 15, 3, 8 and 8 %."""
     assert result.success and result.adequate

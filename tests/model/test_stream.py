@@ -328,6 +328,7 @@ def assert_drawn_on_the_way(noise, active):
     assert largest(drawn[0], given[0]) < tolerance and largest(drawn[1], given[1]) < tolerance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NOISES)
 def test_what_is_drawn_on_the_way_is_the_path_that_draw_and_realise_give(x64, name):
     assert_drawn_on_the_way(*NOISES[name])

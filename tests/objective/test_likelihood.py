@@ -261,6 +261,7 @@ def test_a_dynamic_stiffness_adds_the_gaussian_density_of_its_parts(x64):
     assert float(found) == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_whittle_is_the_law_of_a_periodogram():
     """With a line: scipy's noncentral chi-squared density of 2 I / N with noncentrality 2 L / N."""
     data = recording()

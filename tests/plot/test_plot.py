@@ -1000,6 +1000,7 @@ def refitted(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "draw",
     [

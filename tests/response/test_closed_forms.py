@@ -162,6 +162,7 @@ def coloured_mean(cutoff):
     return RATE * scipy.integrate.simpson(np.exp(-RATE * tau + variance / 2), x=tau)
 
 
+@pytest.mark.slow
 def test_white_noise_is_the_limit_of_band_limited_noise(x64):
     limit = RATE / (RATE - DIFFUSION / 2)
     distance, standard = [], []

@@ -108,6 +108,7 @@ ENVELOPES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ENVELOPES)
 def test_the_harmonic_through_the_activation_is_that_of_a_noise_free_simulation(x64, name):
     kind, inputs, harmonic = ENVELOPES[name]

@@ -172,6 +172,7 @@ def test_similar_muscles_have_similar_equilibria_and_rates(x64, exponent):
         np.testing.assert_allclose(slower, rates / 2, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_dynamic_similarity_is_exact_far_from_linear(x64):
     """Twice the size, times stretched by two: x ∝ s, force ∝ s², along the whole nonlinear run."""
     size = 2.0

@@ -98,6 +98,7 @@ def test_plain_monte_carlo_of_500_seeds_agrees(x64):
 TOGETHER = {"chunk": 32}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", INPUTS)
 def test_linear_trajectories_have_the_expected_spectrum(x64, kind):
     """`E l` is exact: the mean over 128 seeds, one path each beside the nonlinear task."""
@@ -151,6 +152,7 @@ def test_the_nonlinear_part_of_large_noise_is_seen(x64):
     assert np.all(np.abs(estimate.nonlinearity) < 0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [jm.Isometric, jm.PrescribedForce])
 def test_the_controlled_estimate_has_no_linear_time_step_error(x64, kind):
     """Steps of 5 and 2.5 ms on the same paths, which band-limited noise has exactly on each

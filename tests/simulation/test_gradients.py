@@ -29,6 +29,7 @@ SUBSTEPS = {"all": 2}
 WITHOUT_INFLUENCE = {"motion": (), "force": (), "acceleration": (), "all": ("m_z",)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_every_parameter_forward_reverse_and_by_differences(x64, name):
     task = TASKS[name].replace(harmonic_phase=0.4, harmonic_amplitude=0.02)

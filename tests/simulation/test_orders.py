@@ -121,6 +121,7 @@ def test_strong_order(x64, noise, order):
     assert abs(references.observed_order(steps, errors) - order) < 0.15, errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "amplitude, lowest, bound",
     [

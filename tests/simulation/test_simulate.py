@@ -205,6 +205,7 @@ def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
             np.testing.assert_allclose(seen[1:], expected[every - 1 :: every], atol=0.02 * size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["motion", "force", "isometric"])
 def test_tables_of_inputs_and_harmonic_change_nothing(x64, task):
     """A traced call, which may be differentiated in reverse, evaluates them in the loop; a plain

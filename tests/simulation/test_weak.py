@@ -49,6 +49,7 @@ def at_the_end(task, dt, increments, seeds=400_000, seconds=1.0, key=KEY):
     return float(found.mean[-1]), float(found.variance[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("increments", ["weak", "gaussian"])
 def test_weak_order_of_geometric_brownian_motion(x64, increments):
     """Stratonovich, σ = 1: E(1 + y) = exp(-3/2 t), E(1 + y)² = exp(-2 t); Heun's mean is of order

@@ -125,6 +125,7 @@ def test_the_likelihoods_of_the_targets_add_up(x64):
     assert float(likelihood.marginal(moments)) == pytest.approx(sum(each), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_information_adds_up(x64):
     """Of what is shared: at the same point, that of both is the sum of that of each."""
     joint = both()
