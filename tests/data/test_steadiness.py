@@ -338,11 +338,11 @@ def test_a_level_that_wanders_is_noticed():
     than half of them are noticed."""
     walks = np.cumsum(np.random.default_rng(8).standard_normal((20, 1500)), axis=1) / 300 + LEVEL
     said = [
-        any("level wanders" in n for n in _steadiness._wandering([x]))
+        any("level wanders" in n for n in _steadiness._notice_wandering([x]))
         for x in (*forces(40, 15.0, tremor=0, seed=9), *walks)
     ]
     assert sum(said[:40]) <= 7 and sum(said[40:]) >= 15
-    (notice,) = _steadiness._wandering([walks[int(np.flatnonzero(said[40:])[0])]])
+    (notice,) = _steadiness._notice_wandering([walks[int(np.flatnonzero(said[40:])[0])]])
     assert notice in jm.steadiness(jm.Recording(walks[np.flatnonzero(said[40:])[0]], RATE)).notices
 
 

@@ -152,14 +152,14 @@ class Steadiness(Printed, Result, eqx.Module):
                 head,
                 columns,
                 *lines,
-                *self._tremor(),
+                *self._tremor_lines(),
                 _of_errors(count),
                 PEAK,
                 *(f"notice: {notice}" for notice in self.notices),
             ]
         )
 
-    def _tremor(self) -> list[str]:
+    def _tremor_lines(self) -> list[str]:
         """Whether there is one; its frequency and size; the size that would have shown."""
         p, seen = self.measures["tremor_p"].value, self.measures["tremor_size"]
         first = TREMOR["tremor_p"].format(*self.band)
@@ -298,15 +298,15 @@ def steadiness(
     signals = [recording.filtered() for recording in each]
     usual = TREMOR_BANDS.get(each[0].quantity or "", TREMOR_BAND)
     band = usual if band is None else (float(band[0]), float(band[1]))
-    settings = _settings_around(band)
+    settings = _settings_for_band(band)
     segments = [_segments(x, settings) for x in signals]
     own = [_own(x, each[0].unit) for x in signals]
     trials = {
-        name: _stated(m | _tremor([s], settings, band, m), 1, len(s))
+        name: _stated(m | _measure_tremor([s], settings, band, m), 1, len(s))
         for name, m, s in zip(names, own, segments, strict=True)
     }
     together = {name: _together([m[name] for m in own]) for name in own[0]}
-    together |= _tremor(segments, settings, band, together)
+    together |= _measure_tremor(segments, settings, band, together)
     together = _stated(together, len(each), sum(map(len, segments)))
     said = notices_of(each, signals, float(RECORDED.rate), [()] * len(each), each[0].quantity)
     if (
@@ -319,13 +319,13 @@ def steadiness(
             "the errors do not contain how much two trials differ: for that give three or more",
         )
     if len(each) < ENOUGH:
-        said = (*said, *_wandering(signals))
+        said = (*said, *_notice_wandering(signals))
     notices = (*said, *_mind(durations, together, own))
     unit, quantity = each[0].unit, each[0].quantity
     return Steadiness(together, trials, durations, unit, quantity, band, notices)
 
 
-def _wandering(signals: list[np.ndarray]) -> tuple[str, ...]:
+def _notice_wandering(signals: list[np.ndarray]) -> tuple[str, ...]:
     """What to say where the spectrum still rises towards the slowest ordinates, which say how sure
     the mean is.
 
@@ -476,7 +476,7 @@ def _together(each: list[Measure]) -> Measure:
     return _measure(float(np.mean(values)), error, first.unit, first.error_from)
 
 
-def _settings_around(band: tuple[float, float]) -> SpectrumSettings:
+def _settings_for_band(band: tuple[float, float]) -> SpectrumSettings:
     """Those of recordings, with the bins that say what is smooth about a band."""
     first, last = bins_around(band, RECORDED)
     return SpectrumSettings(**AS_RECORDED, first_bin=first, last_bin=last)
@@ -491,7 +491,7 @@ def _segments(
     return power.T[:, bins]
 
 
-def _tremor(
+def _measure_tremor(
     segments: list[Float[np.ndarray, "_ bins"]],  # of each trial
     settings: SpectrumSettings,
     band: tuple[float, float],
@@ -512,7 +512,8 @@ def _tremor(
     found = find_peaks(np.mean(whole, axis=0), settings, counts, band, LEVEL)
     values, errors = (math.nan, math.nan), (math.nan, math.nan)
     if found.peaks:
-        values = measured(np.mean(whole, axis=0))
+        peak = found.peaks[0]
+        values = peak.frequency, scale * math.sqrt(peak.power)
         left_out = [
             measured(np.mean(np.concatenate(groups[:i] + groups[i + 1 :]), axis=0))
             for i in range(len(groups))

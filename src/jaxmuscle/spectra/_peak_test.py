@@ -108,19 +108,17 @@ def find_peaks(
     """
     power = np.asarray(power, float)
     require(bool(np.all(power > 0)), "power", power, "give positive power")
-    family = _family(settings, tuple(segments), (float(band[0]), float(band[1])))
+    family = _build_family(settings, tuple(segments), (float(band[0]), float(band[1])))
     logged = np.log(power[family.bins - settings.first_bin]) - family.bias
-    known, found, first = family.smooth, list[Peak](), 1.0
-    whole = family
+    whole, known, found, ps = family, family.smooth, list[Peak](), list[float]()
     for _ in range(MOST):
-        statistic, place, *_ = _largest(family, known, logged[None])
+        statistic, place, _ = _find_clearest(family, known, logged[None])
         beyond = len(family.null) - np.searchsorted(family.null, statistic[0])
-        p = (1 + int(beyond)) / (1 + len(family.null))
-        first = p if not found else first
-        if p > level:
+        ps.append((1 + int(beyond)) / (1 + len(family.null)))
+        if ps[-1] > level:
             break
         at, width = family.centre[place[0]], family.width[place[0]]
-        found.append(Peak(*_measured(family, known, logged, int(place[0])), float(width), p))
+        found.append(Peak(*_measure(family, known, logged, int(place[0])), float(width), ps[-1]))
         known = np.column_stack([known, family.bells[:, place[0]]])
         # A hill is no exact bell: what is left of its flanks is no peak of its own.
         apart = np.abs(family.centre - at) > np.maximum(width, family.width)
@@ -130,7 +128,7 @@ def find_peaks(
         if not np.any(apart):
             break
     threshold = float(np.quantile(family.null, 1 - level))
-    return PeakTest(first, tuple(found), _detectable(whole, known, logged, threshold))
+    return PeakTest(ps[0], tuple(found), _detectable_power(whole, known, logged, threshold))
 
 
 def measure_peak(
@@ -141,14 +139,14 @@ def measure_peak(
 ) -> tuple[float, float]:
     """Frequency [Hz] and power of the clearest peak of the band, whether or not it is
     significant."""
-    family = _family(settings, tuple(segments), (float(band[0]), float(band[1])))
+    family = _build_family(settings, tuple(segments), (float(band[0]), float(band[1])))
     logged = np.log(np.asarray(power, float)[family.bins - settings.first_bin]) - family.bias
-    _, place, *_ = _largest(family, family.smooth, logged[None])
-    return _measured(family, family.smooth, logged, int(place[0]))
+    _, place, _ = _find_clearest(family, family.smooth, logged[None])
+    return _measure(family, family.smooth, logged, int(place[0]))
 
 
 @functools.lru_cache(maxsize=64)
-def _family(
+def _build_family(
     settings: SpectrumSettings, segments: tuple[int, ...], band: tuple[float, float]
 ) -> _Family:
     first, last = bins_around(band, settings)
@@ -174,15 +172,15 @@ def _family(
     scores = np.random.default_rng(0).standard_normal((DRAWS, len(bins)))
     scores = scores @ np.linalg.cholesky(law.correlation).T
     drawn = scipy.special.gammaincinv(half, scipy.special.ndtr(scores)) / half
-    statistic, *_ = _largest(family, smooth, np.log(drawn) - bias)
+    statistic, _, _ = _find_clearest(family, smooth, np.log(drawn) - bias)
     return family._replace(null=np.sort(statistic))
 
 
-def _largest(
+def _find_clearest(
     family: _Family, known: Float[np.ndarray, "bins terms"], logged: Float[np.ndarray, "rows bins"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of every row the largest statistic and its bell; beside that the statistics of all bells that
-    the known terms leave something of, and how much."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of every row the largest statistic and the place of its bell; and what the known terms
+    leave of every bell."""
     basis, _ = np.linalg.qr(family.whiten @ known)
     bells = family.whiten @ family.bells
     whole = np.linalg.norm(bells, axis=0)
@@ -196,16 +194,16 @@ def _largest(
     squares = np.sum(rest**2, axis=1, keepdims=True) - score**2
     statistic = np.where(seen, score / np.sqrt(np.maximum(squares, 1e-12) / degrees), -np.inf)
     place = np.argmax(statistic, axis=1)
-    return statistic[np.arange(len(place)), place], place, statistic, np.where(seen, left, 0.0)
+    return statistic[np.arange(len(place)), place], place, np.where(seen, left, 0.0)
 
 
-def _fitted(
+def _fit_terms(
     family: _Family, columns: Float[np.ndarray, "bins terms"], logged: Float[np.ndarray, " bins"]
 ) -> Float[np.ndarray, " terms"]:
     return np.linalg.lstsq(family.whiten @ columns, family.whiten @ logged, rcond=None)[0]
 
 
-def _measured(
+def _measure(
     family: _Family,
     known: Float[np.ndarray, "bins terms"],
     logged: Float[np.ndarray, " bins"],
@@ -218,7 +216,7 @@ def _measured(
     falling spectrum is too high a frequency.
     """
     columns = np.column_stack([known, family.bells[:, place]])
-    terms = _fitted(family, columns, logged)[: known.shape[1]]
+    terms = _fit_terms(family, columns, logged)[: known.shape[1]]
     excess = np.exp(logged + family.bias) - np.exp(known @ terms)
     f, at, width = family.frequency, float(family.centre[place]), float(family.width[place])
     for _ in range(TURNS):
@@ -229,7 +227,7 @@ def _measured(
     return at, max(float(power), 0.0)
 
 
-def _detectable(
+def _detectable_power(
     family: _Family,
     known: Float[np.ndarray, "bins terms"],
     logged: Float[np.ndarray, " bins"],
@@ -242,8 +240,8 @@ def _detectable(
     """
     middle = 0.5 * (family.centre[0] + family.centre[-1])
     place = int(np.argmin(np.abs(family.centre - middle) + 10 * np.abs(family.width - WIDTHS[2])))
-    *_, left = _largest(family, family.smooth, logged[None])
-    terms = _fitted(family, known, logged)
+    _, _, left = _find_clearest(family, family.smooth, logged[None])
+    terms = _fit_terms(family, known, logged)
     rest = family.whiten @ (logged - known @ terms)
     scatter = np.sqrt(np.sum(rest**2) / (len(rest) - known.shape[1]))
     height = (threshold + 1.28) * scatter / max(left[place], 1e-12)
