@@ -41,8 +41,7 @@ SHOWN = (
     "corner_frequency",
     "harmonic_share",
     "harmonic_frequency",
-    "high_frequency_floor",
-    "coefficient_of_variation",
+    "model_coefficient_of_variation",
 )
 JUDGED = (*SHOWN, *(name for name in DEFAULT_FREE if name not in SHOWN))
 

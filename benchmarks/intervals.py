@@ -26,7 +26,7 @@ import numpy as np
 from verdict import run
 
 import jaxmuscle as jm
-from jaxmuscle.data import _steadiness
+from jaxmuscle.data import _measured
 
 RATE, MEAN, DEVIATION = 100.0, 10.0, 0.2
 LEVELS = {
@@ -78,7 +78,7 @@ def steadiness(count: int) -> None:
         held: Counts = defaultdict(lambda: defaultdict(list))
         # A recording is in five groups: what takes long is computed once.
         with mock.patch.multiple(
-            _steadiness, regularity=kept(_steadiness.regularity), dfa=kept(_steadiness.dfa)
+            _measured, regularity=kept(_measured.regularity), dfa=kept(_measured.dfa)
         ):
             for seconds, (corner, tremor) in itertools.product(LENGTHS, kinds):
                 count_held(forces(count, seconds, corner, tremor, 1), tremor, held)
@@ -159,7 +159,7 @@ def trembling(
 def tremor(count: int) -> None:
     """How often a tremor is found, and how often its intervals hold the truth."""
     constant = {"regularity": lambda x: (1.0, 1.0), "dfa": lambda x: 1.0}  # they take long
-    with mock.patch.multiple(_steadiness, **constant):
+    with mock.patch.multiple(_measured, **constant):
         for (seconds, trials), share in itertools.product(TRIED, (0.0, 0.02, 0.05, 0.1)):
             rng, held, found = np.random.default_rng(7), [], 0
             for i in range(count):

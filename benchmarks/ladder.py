@@ -24,9 +24,9 @@ SHARES = {"resonance": 0.03, "resonance_2": 0.08}
 # trials, segments of each
 DESIGNS = {"10 s": (1, 6), "60 s": (1, 45), "ten trials of 15 s": (10, 10)}
 QUANTITIES = (
-    "tremor_frequency",
-    "tremor_width",
-    "tremor_share",
+    "resonance_frequency",
+    "resonance_width",
+    "resonance_share",
     "contraction_time",
     "half_power_frequency",
 )
@@ -69,7 +69,7 @@ def described(task: jm.Isometric) -> str:
     known = consequences(task)
     shown = [
         name
-        for name in ("tremor_share", "resonance_2_share", "harmonic_share")
+        for name in ("resonance_share", "resonance_2_share", "harmonic_share")
         if known.get(name, 0.0) > 0
     ]
     return ", ".join(f"{name} {known[name]:.3f}" for name in shown)

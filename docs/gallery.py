@@ -261,7 +261,7 @@ SECTIONS = (
             ),
             Shown(
                 "gallery/profiles.png",
-                'jm.plot.profiles([corner, jm.profile(result, "high_frequency_floor")])',
+                'jm.plot.profiles([corner, jm.profile(result, "band_8_12")])',
                 "Several profiles",
                 "uncertainty.md",
             ),

@@ -39,8 +39,7 @@ factor of 1.6 either way.)
 
 - The letter at the end says which tissue is meant: `_w` the active one, `_z` the passive one. A small letter is a factor
   (`k_w`, `c_w`), a capital the stiffness or damping itself (`K_w0`). `noise_K_w` is the noise on the stiffness K_w.
-- Three parameters have a second name, the one that motor control uses. Both names work everywhere: `tremor_frequency` is
-  `resonance_frequency`, `tremor_width` is `resonance_width`, `contraction_time` is `activation_time`.
+- `activation_time` has a second name, the one that motor control uses: `contraction_time`. Both names work everywhere.
 - `K_w0`, `K_z0`, `C_w0` and `C_z0` are stiffness and damping at rest. They follow from the parameters. You can read them
   (`task["K_w0"]`, `result["K_w0"]`), but not set or fit them.
 - `harmonic_amplitude` is a fraction of K_w0 and of K_z0: the harmonic acts on both.
@@ -58,7 +57,7 @@ the task has them, `noise_correlation_time`, `activation_time` and all `resonanc
 `m_w` and `m_z` where a motor moved the insertion. (If a target has no spectrum, only `k_w`, `k_z`, `c_w`, `c_z`, `m_w`
 and `m_z` are free.)
 
-A default task has no activation, no tremor, no second resonance and no other noise on the drive. For the first three the
+A default task has no activation, no resonance, no second resonance and no other noise on the drive. For the first three the
 column *default* says with which value they begin when you add them (`jm.on_rung`, `jm.Activation()`, `jm.ResonantNoise()`).
 Noise on the drive you add with a value of your own: `task.replace(noise_P_w=0.02)` (0.02 in the
 table is a usual size). In
@@ -73,7 +72,7 @@ FIT = """
 A fit has a [prior](../glossary.md#the-fit) for every free parameter. The prior is centred on the value that the parameter
 has in the task which you pass in. *Prior sd* is the standard deviation of the prior. A positive parameter is fitted in *log
 space*: its *prior sd* is that of the logarithm. For the other parameters it is in their own unit. *Reached by a fit* are the
-bounds of the search. In models with activation or tremor the *prior sd* of k_w, k_z, c_w and c_z is 0.5, unless a motor
+bounds of the search. In models with activation or resonance the *prior sd* of k_w, k_z, c_w and c_z is 0.5, unless a motor
 moved the insertion ([why](../force.md)). *The paper* is the one from which [the model](../model.md) comes.
 
 | name | log space | prior sd | reached by a fit | source of the default |
@@ -100,7 +99,7 @@ a table of its keys. The fields of [`SpectrumSettings`](spectra.md) and of a tas
 repeated here. Let `save_preset` write the table of a task.
 
 **Columns.** *If missing* says what a file means that lacks the key; *error* means that such a file is refused. *Since* is
-the first version of the format that has the key. A later version of jaxmuscle reads earlier formats.
+the first version of the format that has the key. Presets of format 1 are read, too.
 
 **Types.** A *table* is what Python calls a dict: an object in JSON, a `[table]` in TOML. The keys of a *table by name* are
 not fixed: they are, for example, the names of parameters. Brackets hold the type of one entry: in a *list of (number or
@@ -112,19 +111,18 @@ an error names the file and the key. Numbers must be finite. `true` is not 1, an
 
 `docs/generate.py` writes this page from the code that checks the files.
 """
-FIT_FILE = """JSON, format 4. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
+FIT_FILE = """JSON, format 5. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
 `task_table` alone. A fit of one target has the keys of the first two tables side by side. In a
 [joint fit](../identifiability.md#a-joint-fit) (*several targets* below)
 the keys of the second table stand under `parts`, by the name of the target. What the file says twice must agree: the
-value of a parameter with the `task_table`, the spectrum with the `target_table`. A file of format 2 may
-lack keys of `task_table` and `target_table`: then the fit has no such thing."""
+value of a parameter with the `task_table`, the spectrum with the `target_table`. What was measured without the model
+stands under `measured` in the `target_table`. Earlier formats are not read: fit again."""
 PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
 the task and of its parts. `type` is the class of a part. What a task does not have (`activation`; `initial`, the state
 from which a simulation begins; in its spectrum settings `filter_cutoff`, the low-pass) is written as `"none"`. Format 1
 has no key `format`, and may leave out what a task does not have."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
-the same keys without `format`, and `null` for what is not stated; only format 2 may lack keys. *If missing* is for the
-.toml."""
+the same keys without `format`, and `null` for what is not stated. *If missing* is for the .toml."""
 STUDY = """A study is a table of recordings with options ([a study](../study.md)). `run_study` reads it. You can write it in
 two ways:
 
@@ -139,7 +137,7 @@ SECTIONS = (
     (
         "fit.json",
         FIT_FILE,
-        2,
+        5,
         (
             F.FitTable,
             F.PartTable,
@@ -167,9 +165,6 @@ NAMES = {
     type(None): "null",
 }
 LATER = {
-    ("StartTable", "values"): 4,
-    ("SettingsTable", "increments"): 4,
-    ("SettingsTable", "optimiser"): 3,
     ("PresetFile", "format"): 2,
 }
 POWERS = str.maketrans("23", "²³")

@@ -146,6 +146,8 @@ def _same_target(target: jm.Target, text: str) -> bool:
     for key in ("name", "quantity", "provenance", "source", "mvc_fraction", "unit", "reason"):
         if getattr(target, key) != said.get(key):
             return False
+    if not _close(target.to_table().get("measured"), said.get("measured")):
+        return False
     for key in ("segments", "coefficient_of_variation", "mean"):
         value = said.get(key)
         value = value if value is None or isinstance(value, list) else [value]
@@ -268,7 +270,7 @@ def formats(folder: Path, result: jm.fits.FitResult) -> list[Format]:
         source="here",
         settings=jm.SpectrumSettings(filter_direction="both"),
     )
-    target.save(folder / "target.toml")
+    target.with_measures().save(folder / "target.toml")
     rng = np.random.default_rng(0)
     samples = 5 + 0.1 * rng.standard_normal(200)
     recording = "# a trial\ntime_s,force_N\n" + "".join(

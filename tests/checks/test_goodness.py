@@ -316,7 +316,7 @@ def bounds(q):
 def test_stated_errors_hold_for_a_well_determined_fit():
     found = bootstrapped()
     assert not found.failed and found.source == _bootstrap.SIMULATED
-    assert {"c_w", "noise_K_z", "corner_frequency", "high_frequency_floor"} <= set(found.quantities)
+    assert {"c_w", "noise_K_z", "corner_frequency", "band_8_12"} <= set(found.quantities)
     for q in found.quantities.values():
         low, high, least = bounds(q)
         assert low < q.ratio < high and q.inside[0] >= least, (q.name, q.ratio, q.inside)

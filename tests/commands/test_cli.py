@@ -462,17 +462,32 @@ def test_a_fit_writes_result_table_and_figure(fitted):
 def test_a_fit_prints_what_it_found(fitted):
     outcome, folder = fitted
     for part in (
+        "median frequency",
         "c_w",
         "noise_K_w",
-        "corner_frequency",
+        "half_power_frequency",
         "chi2 per bin",
         "converged: ",
         f"{folder}/fit.json",
     ):
         assert part in outcome.stdout
     assert "rescaled to 1" in outcome.stderr
-    # Nothing but the parameters that were fitted and what follows from them.
-    assert "m_w" not in outcome.stdout
+    # Nothing but the parameters that were fitted, and few of what follows from them.
+    assert "m_w" not in outcome.stdout and "corner_frequency" not in outcome.stdout
+
+
+def test_all_prints_everything(tmp_path, monkeypatch):
+    monkeypatch.setattr(jm, "fit", lambda *_, **__: made_result())
+    path = csv_file(tmp_path)
+    short = run("fit", path, "--out", tmp_path / "short")
+    whole = run("fit", path, "--all", "--out", tmp_path / "whole")
+    assert short.exit_code == whole.exit_code == 0
+    assert short.stdout.startswith(str(made_result()))
+    assert whole.stdout.startswith(made_result().details())
+    assert "models tried" in whole.stdout and "models tried" not in short.stdout
+    assert "`jaxmuscle fit --all`" in short.stdout and "--all" not in whole.stdout
+    kept, same = ((tmp_path / name / "fit.json").read_bytes() for name in ("short", "whole"))
+    assert kept == same
 
 
 def test_what_was_fitted_can_be_explored(fitted, tmp_path):
@@ -663,7 +678,8 @@ def test_the_exit_code_says_whether_it_converged(result, code, word, tmp_path, m
     (tmp_path / "fit.png").write_text("of an earlier fit")
     outcome = run("fit", csv_file(tmp_path, name="mine.csv"), "--out", tmp_path)
     assert outcome.exit_code == code
-    assert outcome.stdout.startswith(word) and "made (user)" in outcome.stdout
+    first, *rest = outcome.stdout.splitlines()
+    assert first.startswith("made (user)") and any(line.startswith(word) for line in rest)
     assert result.message in " ".join(outcome.stdout.split())
     assert_equal(jm.load_result(tmp_path / "fit.json"), result)
     assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
@@ -833,12 +849,14 @@ def test_a_cohort_as_json(tmp_path, monkeypatch):
     assert outcome.exit_code == 2  # c could not be read
     found = strict(outcome.stdout)
     assert found["success"] is False and found["failed"] == {"c": "no file"}
-    assert [(row["quantity"], row["a"], row["b"]) for row in found["differences"]] == [
-        ("c_w", "old", "young")
-    ]
+    differences = [(row["quantity"], row["a"], row["b"]) for row in found["differences"]]
+    measured = dict.fromkeys(row["quantity"] for row in found["table"] if row["kind"] == "measured")
+    assert {"coefficient_of_variation", "share_8_12"} < set(measured)
+    assert {row[1:] for row in differences} == {("old", "young")}
+    assert [row[0] for row in differences if row[0] not in measured] == ["c_w"]
     # "a" has no scale of force: what has newtons is over its mean of 2.5 N. "b" failed: NaN is
     # null.
-    assert [row["value"] for row in found["table"] if row["quantity"] == "mean"] == [None]
+    assert [row["value"] for row in found["table"] if row["quantity"] == "model_mean"] == [None]
     assert next(
         row["value"] for row in found["table"] if row["quantity"] == "c_w"
     ) == pytest.approx(50 / 3 / 2.5)
@@ -1041,10 +1059,10 @@ def made_comparison(target, *, success):
         )
         for noise, aic, weight, settled in (
             ("band-limited", 28.0, 0.9, True),
-            ("tremor", 32.0, 0.1, success),
+            ("resonance", 32.0, 0.1, success),
         )
     ]
-    tasks = {("band-limited", False): jm.Isometric(), ("tremor", False): task}
+    tasks = {("band-limited", False): jm.Isometric(), ("resonance", False): task}
     fitted = {(row.noise, row.harmonic): np.asarray(target.proportional_power) for row in rows}
     return jm.comparison.Comparison(target, tuple(rows), {}, tasks, fitted, 12.0, 3, 0)
 
@@ -1065,7 +1083,7 @@ def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
     ((task, target),) = asked
     assert_equal(target, result.target)
     assert type(task) is type(result.task)
-    unsettled = "the search did not converge for tremor, no harmonic. Do not use these rows"
+    unsettled = "the search did not converge for resonance, no harmonic. Do not use these rows"
     assert (outcome.exit_code, unsettled in outcome.output) == (
         (0, False) if success else (1, True)
     )

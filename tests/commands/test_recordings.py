@@ -181,15 +181,17 @@ def test_two_commands_from_raw_trials_to_a_fit(folder, tmp_path):
     options = ("--quick", "--rungs", 0, "--starts", 16)
     assert run("fit", target, *options, "--out", tmp_path / "two").exit_code == 0
     result = jm.load_result(tmp_path / "two" / "fit.json")
-    measured = [np.mean(jm.load_recording(path).steady().samples) for path in paths(folder)]
-    mean = result["mean"]
+    held = [jm.load_recording(path).steady() for path in paths(folder)]
+    measured, mean = [np.mean(recording.samples) for recording in held], result["model_mean"]
     assert abs(mean.value - np.mean(measured)) < 2 * mean.stderr < 0.02 * LEVEL
     # One command does the same.
     assert run("fit", *paths(folder), *options, "--out", tmp_path / "one").exit_code == 0
     again = jm.load_result(tmp_path / "one" / "fit.json")
-    assert again["mean"].value == pytest.approx(mean.value) and again.chi2_per_bin == pytest.approx(
-        result.chi2_per_bin
-    )
+    assert again["model_mean"].value == pytest.approx(mean.value)
+    assert again.chi2_per_bin == pytest.approx(result.chi2_per_bin)
+    own = jm.steadiness(held)
+    for name in ("mean", "coefficient_of_variation", "sample_entropy", "median_frequency"):
+        assert again[name] == result[name] == own[name]
 
 
 def with_angle(path, moves):

@@ -2,6 +2,7 @@
 printed."""
 
 import numpy as np
+import pandas
 import pytest
 from test_study import made_study
 from typer.testing import CliRunner
@@ -63,7 +64,7 @@ def test_a_study_is_overwritten_only_with_force(table, tmp_path, monkeypatch):
         "--window",
         "1:9",
         "--quantities",
-        "mean, tremor_share",
+        "mean, resonance_share",
         "--spectrum",
         "slow",
         "--skip-rows",
@@ -75,7 +76,7 @@ def test_a_study_is_overwritten_only_with_force(table, tmp_path, monkeypatch):
     assert (asked["rung"], asked["window"], asked["quantities"]) == (
         2,
         (1.0, 9.0),
-        ["mean", "tremor_share"],
+        ["mean", "resonance_share"],
     )
     assert (asked["spectrum"], asked["skip_rows"], asked["time"]) == ("slow", 2, "clock")
     assert not {"max_gap", "axis"} & set(asked)  # of study.toml, if it states them
@@ -85,3 +86,20 @@ def test_a_study_is_overwritten_only_with_force(table, tmp_path, monkeypatch):
     assert again.exit_code == 2 and "overwrite it with --force" in again.stderr
     assert (out / "study.json").read_bytes() == before
     assert command(table, "--out", out, "--force").exit_code == 0
+
+
+def test_steadiness_of_a_study_is_its_measured_part(table, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["steadiness", table, "--rate", 100, "--window", "1:11", "--out", out]
+    result = CliRunner().invoke(app, list(map(str, arguments)), env={"COLUMNS": "300"})
+    assert result.exit_code == 0, result.stderr
+    found = jm.run_study(table, fit=False, rate=100.0, window=(1.0, 11.0))
+    assert "Table 1: mean ± SD of people" in result.stdout and "model" not in result.stdout
+    written = pandas.read_csv(out / "table1.csv", keep_default_na=False)
+    assert list(written["quantity"]) == [row["quantity"] for row in found.table_1()]
+    values = written["mean"].replace("", "nan").astype(float)
+    np.testing.assert_allclose(values, [row["mean"] for row in found.table_1()], rtol=1e-11)
+    people = pandas.read_csv(out / "people.csv")
+    assert set(people["kind"]) == {"measured"} and set(people["person"]) == {"a", "b"}
+    again = CliRunner().invoke(app, [*map(str, arguments), "--force", "--band", "4:9"])
+    assert again.exit_code == 2 and "--band: of a study leave it out" in again.stderr

@@ -122,7 +122,7 @@ def test_a_tremor_is_told_from_a_line():
     found = compare(
         jm.Isometric(),
         target_of(task, 1, 300, settings=None),
-        noises=("band-limited", "tremor"),
+        noises=("band-limited", "resonance"),
         free=free,
         priors={"resonance_amplitude": 2.0, "harmonic_frequency": 0.3},
         groups=GROUPS,
@@ -130,11 +130,11 @@ def test_a_tremor_is_told_from_a_line():
     assert [(row.noise, row.harmonic) for row in found.rows] == [
         ("band-limited", True),
         ("band-limited", False),
-        ("tremor", False),
+        ("resonance", False),
     ]
-    assert found.between("tremor", "band-limited").winner == "tremor" == found.best.noise
+    assert found.between("resonance", "band-limited").winner == "resonance" == found.best.noise
     assert [row.adequate for row in found.rows] == [False, False, True]
-    assert found.tasks["tremor", False]["resonance_amplitude"] == pytest.approx(0.1, rel=0.2)
+    assert found.tasks["resonance", False]["resonance_amplitude"] == pytest.approx(0.1, rel=0.2)
     assert (
         "the data prefer tremor to band-limited" in found.verdict[0]
         and found.harmonic.b == "no harmonic"
@@ -318,14 +318,16 @@ def test_a_richer_model_is_also_sought_from_where_the_best_poorer_one_ended(x64)
         ("activation", False): {"aic": 4.0, "task": on(1)},
         ("two resonances", False): {"aic": 0.0, "task": on(3)},  # richer
     }
-    known = _compare._poorer("tremor", task, ended)
+    known = _compare._poorer("resonance", task, ended)
     assert (
         known["c_w"] == 3.0
         and known["activation_time"] == 0.2
         and "resonance_frequency" not in known
     )
     assert (
-        _compare._poorer("activation", task, ended) is None is _compare._poorer("tremor", task, {})
+        _compare._poorer("activation", task, ended)
+        is None
+        is _compare._poorer("resonance", task, {})
     )
     free = ("c_w", "activation_time", "resonance_amplitude", "resonance_frequency")
     problem = planned(on(2), target_of(on(2)), FitOptions(free=free)).problem
@@ -432,9 +434,9 @@ def test_verdict_in_words():
         "the AIC must differ by 12.8 or more, since chance alone would find some frequency that"
         " fits a little better"
     )
-    tremor = dataclasses.replace(found.best, noise="tremor", aic=-1e3, harmonic=False)
+    tremor = dataclasses.replace(found.best, noise="resonance", aic=-1e3, harmonic=False)
     richer = dataclasses.replace(found, rows=(*found.rows, tremor)).verdict
-    assert richer[-1] == f"among the models without tremor, {said[2]}"
+    assert richer[-1] == f"among the models without resonance, {said[2]}"
     split = (
         "AIC and held-out score disagree (for pink: AIC lower by 8.0, held-out score lower by 8.0"
     )
@@ -520,11 +522,11 @@ def test_what_a_task_cannot_carry_is_left_out_with_its_own_reason():
     )
     assert tuple(carried) == ("white", *COLOURS) and left_out == {}
     carried, left_out = _compare._carried(
-        jm.on_rung(jm.Isometric(), 1), ("band-limited", "pink", "tremor"), {}
+        jm.on_rung(jm.Isometric(), 1), ("band-limited", "pink", "resonance"), {}
     )
     assert (
         tuple(carried) == ("band-limited", "pink")
-        and "has an activation or a resonance already" in left_out["tremor"]
+        and "has an activation or a resonance already" in left_out["resonance"]
     )
     mine = jm.Isometric(noise=jm.BandLimitedNoise(cutoff=20.0))
     assert float(_compare._carried(mine, COLOURS, {})[0]["band-limited"]["noise_cutoff"]) == 20.0

@@ -590,7 +590,7 @@ def test_bundled_targets_are_no_figures(option, word):
 def test_command_passes_dataset_and_axis_on(made, tmp_path, monkeypatch):
     path, seen = write(tmp_path, made), []
     monkeypatch.setattr(jm, "fit", lambda _, target, **__: seen.append(target))
-    monkeypatch.setattr(_cli_fit, "_fit_one", lambda fit, *_: fit(None, None) is None)
+    monkeypatch.setattr(_cli_fit, "_fit_one", lambda fit, *_, **__: fit(None, None) is None)
     result = CliRunner().invoke(app, ["fit", str(path), "--dataset", "95 MVC", "--segments", "6"])
     assert result.exit_code == 0 and seen[0] == load_target(path, dataset="95 MVC", segments=6)
     rows = "".join(

@@ -11,17 +11,21 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas
 import pytest
+import scipy.fft
+import scipy.optimize
 import scipy.signal
 import scipy.special
 import scipy.stats
+from entropies import without_entropies
 from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxmuscle as jm
-from jaxmuscle.data import Measure, _steadiness
+from jaxmuscle.data import Measure, _measured_text, _steadiness
 from jaxmuscle.data._measure import likelier_error, log_interval, logit_interval, student_interval
-from jaxmuscle.data._steadiness import (
+from jaxmuscle.data._measured import (
     RANGES,
+    RECORDED,
     _error,
     _interval,
     _own,
@@ -37,6 +41,7 @@ from jaxmuscle.spectra._measures import approximate_entropy, sample_entropy
 RATE, LEVEL, SD = 100.0, 10.0, 0.3
 CV = "coefficient_of_variation"
 TREMOR = {f"tremor_{name}" for name in ("p", "frequency", "size", "detectable")}
+BY_SEGMENTS = {*TREMOR, "median_frequency"}
 
 
 def density(f, tremor):
@@ -86,10 +91,30 @@ def test_the_simulated_forces_have_their_deviation():
     assert np.mean(x.var(axis=1) + (x.mean(axis=1) - LEVEL) ** 2) == pytest.approx(SD**2, rel=0.05)
 
 
+def half_power(x):
+    """Below which half of the power in the bins 1 to 30 of SciPy's Welch spectrum lies, each bin
+    being even."""
+    f, power = scipy.signal.welch(x, 100.0, "hann", 256, 128, detrend="constant")
+    f, power, half = f[1:31], power[1:31], 0.5 * f[1]
+
+    def surplus(at):
+        return np.sum(power * np.clip((at - f + half) / (2 * half), 0, 1)) - np.sum(power) / 2
+
+    return scipy.optimize.brentq(surplus, f[0] - half, f[-1] + half, xtol=1e-13)
+
+
+def band_powers(x):
+    """By name, of the cosine transform."""
+    f = np.arange(x.size) * RATE / (2 * x.size)
+    power = scipy.fft.dct(x - x.mean(), norm="ortho") ** 2 / x.size
+    return {name: np.sum(power[(f >= low) & (f < high)]) for name, (low, high) in RANGES.items()}
+
+
 def test_each_number_of_one_recording():
     recording = trials()[0]
     x, one = np.ascontiguousarray(recording.filtered()), jm.steadiness(recording)
     line = np.polyval(np.polyfit(np.arange(x.size), x, 1), np.arange(x.size))
+    powers = band_powers(x)
     expected = {
         "mean": x.mean(),
         "standard_deviation": x.std(),
@@ -98,7 +123,11 @@ def test_each_number_of_one_recording():
         "approximate_entropy": approximate_entropy(x),
         "sample_entropy": sample_entropy(x),
         "dfa_exponent": dfa(x),
+        "median_frequency": half_power(x),
     }
+    expected |= {f"power{name}": power for name, power in powers.items()}
+    expected |= {f"relative_power{name}": power / x.mean() ** 2 for name, power in powers.items()}
+    expected |= {f"share{name}": power / x.var() for name, power in powers.items()}
     for name, value in expected.items():
         assert one[name].value == pytest.approx(value, rel=1e-9), name
     assert one.measures == one.trials["trial 0"]
@@ -108,7 +137,7 @@ def test_each_number_of_one_recording():
         "approximate_entropy": "parts",
         "sample_entropy": "parts",
         "dfa_exponent": "parts",
-    } | dict.fromkeys(TREMOR, "segments")
+    } | dict.fromkeys(BY_SEGMENTS, "segments")
     parts = [dfa(part) for part in np.array_split(x, 4)]
     assert one["dfa_exponent"].stderr == pytest.approx(scipy.stats.sem(parts))
 
@@ -134,7 +163,7 @@ def test_bands_are_those_of_a_fit(found):
     }
     assert set(RANGES) - {"_above_12"} == of_fits
     # what is above was filtered out
-    assert _steadiness.CUT_OFF == 30.0 and "\n  12 to 30 Hz " in str(found)
+    assert _measured_text.CUT_OFF == 30.0 and "\n  12 to 30 Hz " in str(found)
 
 
 @functools.cache
@@ -166,8 +195,11 @@ SURE = [
     "power_0_0.5",
     "power_1_2",
     "power_8_12",
+    "relative_power_0_0.5",
+    "relative_power_8_12",
     "share_0_0.5",
     "share_8_12",
+    "median_frequency",
     "sample_entropy",
     "dfa_exponent",
 ]
@@ -259,7 +291,9 @@ def test_a_band_is_looked_through(found):
 def test_segments_average_to_the_welch_spectrum():
     recording = trials()[0]
     np.testing.assert_allclose(
-        _segments(recording.filtered()).mean(axis=0), recording.spectrum().power, rtol=1e-9
+        _segments(recording.filtered(), RECORDED).mean(axis=0),
+        recording.spectrum().power,
+        rtol=1e-9,
     )
 
 
@@ -303,8 +337,13 @@ def test_units_are_said_as_they_are(unit, square):
         and one[CV].unit == "1"
     )
     text = str(one)
-    assert f"[{unit}]" in text and f"power by band [{square}]" in text and f" {unit}  " in text
+    assert f"[{unit}]" in text and f" {unit}  " in text and square not in text
+    assert "\npower by band, in millionths of the squared mean\n" in text
     assert max(len(line) for line in text.splitlines()) <= 80
+    about = jm.steadiness(jm.Recording(forces(3, 15.0)[0] - LEVEL, RATE, unit=unit))
+    assert f"\npower by band [{square}]\n" in str(about) and math.isnan(
+        about["relative_power_8_12"].value
+    )
 
 
 def test_mistakes_are_named(user_view):
@@ -480,7 +519,7 @@ def expected_interval(name, m, count, segments):
         degrees = 3 * count
     elif name == "mean":
         degrees = 4 * count
-    elif name in TREMOR:
+    elif name in BY_SEGMENTS:
         degrees = segments - 1
     elif name.startswith("share"):
         logit = scipy.special.logit(m.value)
@@ -567,15 +606,19 @@ def test_intervals_by_scatter_are_cut_where_no_value_can_lie():
 def test_what_is_printed_is_what_is_saved(count, found):
     one = found if count == 3 else jm.steadiness(trials()[0])
     rows = re.findall(r"(\S+) ± (\S+)(?: N| %| Hz)? +(\S+) to (\S+)$", str(one), re.MULTILINE)
-    words = list(_steadiness.WORDS)
-    bands = [f"{kind}{name}" for kind in ("power", "share") for name in RANGES]
-    names = words[:5] + bands + words[5:] + ["tremor_frequency", "tremor_size"]
+    bands = [f"{kind}{name}" for kind in ("relative_power", "share") for name in RANGES]
+    tremor = ["tremor_frequency", "tremor_size"]
+    names = [*_measured_text.WORDS, *bands, *_measured_text.REGULAR, *tremor]
     saved = one.to_dict()["measures"]
-    assert len(rows) == len(names) and set(saved) == {*names, "tremor_p", "tremor_detectable"}
+    unprinted = {"tremor_p", "tremor_detectable", *(f"power{name}" for name in RANGES)}
+    assert len(rows) == len(names) and set(saved) == {*names, *unprinted}
     for name, row in zip(names, rows, strict=True):
         scale = 100 if name.startswith((CV, "share", "tremor_size")) else 1
+        scale = 1e6 if name.startswith("relative_power") else scale
         numbers = [saved[name]["value"], saved[name]["stderr"], *saved[name]["interval"]]
-        half_a_place = 0.5 * 10.0 ** -len(row[1].partition(".")[2])
+        whole, _, decimals = row[1].partition(".")
+        # of the error two digits are printed
+        half_a_place = 0.5 * 10.0 ** (-len(decimals) if decimals else len(whole) - 2)
         np.testing.assert_allclose(
             [float(x) for x in row], np.multiply(scale, numbers), atol=1.001 * half_a_place, rtol=0
         )
@@ -584,23 +627,16 @@ def test_what_is_printed_is_what_is_saved(count, found):
 CHANCE = 1e-4
 
 
-@pytest.fixture(scope="module")
-def without_entropies():
-    """They take most of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_steadiness, "regularity", lambda x: (1.0, 1.0))
-        patch.setattr(_steadiness, "dfa", lambda x: 1.0)
-        yield
-
-
 def held(name, truth, measures):
     return sum(m[name].interval[0] <= truth <= m[name].interval[1] for m in measures)
 
 
-def test_intervals_of_the_mean_hold_it(without_entropies):
+def test_intervals_of_the_mean_hold_it():
     """Of a white signal the four slowest ordinates and the mean are independent, so t is exact;
     1.96 errors hold 88 %."""
-    own = [_own(x, "N") for x in LEVEL + SD * np.random.default_rng(6).standard_normal((400, 400))]
+    signals = LEVEL + SD * np.random.default_rng(6).standard_normal((400, 400))
+    with without_entropies():
+        own = [_own(x, "N") for x in signals]
     one = [_stated(m, 1, 2) for m in own]
     two = [
         _stated({"mean": _together([a["mean"], b["mean"]])}, 2, 4)
@@ -612,11 +648,14 @@ def test_intervals_of_the_mean_hold_it(without_entropies):
 
 
 @pytest.fixture(scope="module")
-def recordings_of_20_s(without_entropies):
-    return [_stated(_own(x, "N"), 1, 2) for x in forces(200, 20.0, seed=7)]
+def recordings_of_20_s():
+    with without_entropies():
+        return [_stated(_own(x, "N"), 1, 2) for x in forces(200, 20.0, seed=7)]
 
 
-@pytest.mark.parametrize("name", ["power_0_0.5", "power_0.5_1", "power_1_2", "share_0.5_1", CV])
+@pytest.mark.parametrize(
+    "name", ["power_0_0.5", "power_0.5_1", "power_1_2", "relative_power_1_2", "share_0.5_1", CV]
+)
 def test_intervals_of_a_power_hold_it(name, recordings_of_20_s):
     """91 % or more by the table in docs/recordings.md, of which 1 % is chance."""
     truth = np.mean([m[name].value for m in recordings_of_20_s])

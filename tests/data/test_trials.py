@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
+from entropies import without_entropies
 from refits import without_intervals
 
 import jaxmuscle as jm
@@ -18,6 +19,12 @@ from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.spectra._bin_law import bin_statistics, mean_error
 
 RATE, SECONDS, LEVEL = 200, 15.0, 40.5
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _leave_out_entropies():
+    with without_entropies():
+        yield
 
 
 def signal(rng, sd=0.8, corner=3.0, seconds=SECONDS):
@@ -495,7 +502,7 @@ def test_a_fit_has_the_measured_mean(strong):
     without newtons."""
     found, result = strong
     measured = np.mean([np.mean(r.samples) for r in found])
-    mean, error = result.derived["mean"].value, result.derived["mean"].stderr
+    mean, error = result["model_mean"].value, result["model_mean"].stderr
     assert abs(mean - measured) < 2 * error < 0.05 * measured
     assert (
         "P_w" in result.free and result.settings["mean_force"] is not None and not result.per_newton
@@ -503,7 +510,7 @@ def test_a_fit_has_the_measured_mean(strong):
     assert result.task["m_w"] > 5 * jm.Isometric()["m_w"]
     target = jm.Trials(found).target()
     assert result.settings["carried"] == pytest.approx(result.task["m_w"] / jm.Isometric()["m_w"])
-    said = " ".join(str(result).split())
+    said = " ".join(result.details().split())
     assert "the muscle has the measured mean force" in said
     assert (
         f"The masses are the usual 0.5 kg times {result.settings['carried']:.3g}. They are no"
@@ -517,16 +524,25 @@ def test_a_fit_has_the_measured_mean(strong):
     # Another scale of force is the same spectrum: P_w is one more freedom, which a mean takes away
     # again.
     assert result.chi2_per_bin == pytest.approx(without.chi2_per_bin, rel=0.05)
-    for name in ("coefficient_of_variation", "half_power_frequency"):
+    for name in ("model_coefficient_of_variation", "half_power_frequency"):
         assert result.derived[name].value == pytest.approx(without.derived[name].value, rel=0.05)
+
+
+def test_a_fit_of_recordings_keeps_what_was_measured(strong, tmp_path):
+    found, result = strong
+    wanted = {name: m.row() for name, m in jm.steadiness(found).measures.items()}
+    result.save(tmp_path / "fit.json")
+    for kept in (result, jm.load_result(tmp_path / "fit.json")):
+        np.testing.assert_equal({name: m.row() for name, m in kept.measured.items()}, wanted)
+        assert kept["mean"] == kept.measured["mean"] != kept["model_mean"]
 
 
 def test_profile_and_reopening_keep_the_mean(strong):
     _, result = strong
-    found = jm.profile(result, "mean")
+    found, mean = jm.profile(result, "model_mean"), result["model_mean"]
     ((low, high),) = found.intervals
-    assert low < result.derived["mean"].value < high
-    assert (high - low) / 2 == pytest.approx(1.96 * result.derived["mean"].stderr, rel=0.2)
+    assert low < mean.value < high
+    assert (high - low) / 2 == pytest.approx(1.96 * mean.stderr, rel=0.2)
 
 
 def test_a_joint_fit_at_two_forces():
@@ -541,7 +557,7 @@ def test_a_joint_fit_at_two_forces():
     assert {"P_w@weak", "P_w@strong"} <= set(result.free) and "k_w" in result.free
     for name, recordings in found.items():
         measured = np.mean([np.mean(r.samples) for r in recordings])
-        mean = result[f"mean@{name}"]
+        mean = result[f"model_mean@{name}"]
         assert abs(mean.value - measured) < 2 * mean.stderr < 0.05 * measured
     assert result["P_w@strong"].value > result["P_w@weak"].value
 

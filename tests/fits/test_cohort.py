@@ -21,6 +21,7 @@ import jaxmuscle as jm
 from jaxmuscle.commands import cohort as _cli_cohort
 from jaxmuscle.commands.main import app
 from jaxmuscle.fits import Estimate
+from jaxmuscle.fits._adequacy import Adequacy
 
 PEOPLE, SEEDS = 6, 20
 
@@ -88,7 +89,7 @@ def test_what_the_data_determine_is_recovered():
             abs(result.derived["harmonic_frequency"].value - truth["harmonic_frequency"])
             < 0.25 * 0.390625
         )
-        for name in ("corner_frequency", "harmonic_share", "high_frequency_floor"):
+        for name in ("corner_frequency", "harmonic_share", "band_8_12"):
             estimate = result.derived[name]
             assert estimate.stderr is not None
             deviations.append((estimate.value - truth[name]) / estimate.stderr)
@@ -151,7 +152,8 @@ def test_the_verdict_names_what_is_missed_and_what_cannot_be_judged():
     assert verdict((True, True), (True, True)) == "the model describes 2 of 2 targets"
     assert (
         verdict((True, True), (True, False), (True, None))
-        == "the model describes 1 of 2 targets; it does not describe t1, whose errors are widened"
+        == "the model describes 1 of 2 targets; it does not describe t1, so the model's numbers of"
+        " these are left out of comparisons"
     )
     assert verdict((True, None), (False, None)).startswith(
         "whether the model describes the targets cannot be judged"
@@ -214,24 +216,27 @@ def test_tables_hold_every_quantity_of_every_target():
 
 
 @pytest.mark.parametrize("whose", ["", "@a"])
-def test_a_tremor_is_listed_once_by_the_name_that_people_use(whose):
-    frequency, width = Estimate(9.0, "Hz", 0.3), Estimate(2.0, "Hz", None, True, False)
+def test_what_is_parameter_and_derived_is_listed_once_by_the_name_that_people_use(whose):
+    frequency, time = Estimate(9.0, "Hz", 0.3), Estimate(0.05, "s", None, True, False)
     result = made_result(
         parameters={
-            f"resonance_frequency{whose}": frequency,
-            f"resonance_width{whose}": width,
             "c_w": Estimate(60.0, "N"),
+            f"resonance_frequency{whose}": frequency,
+            f"activation_time{whose}": time,
         },
         derived={
-            f"tremor_frequency{whose}": frequency,
-            f"tremor_width{whose}": width,
-            "mean": Estimate(2.5, "N"),
+            f"resonance_frequency{whose}": frequency,
+            f"contraction_time{whose}": time,
+            "model_mean": Estimate(2.5, "N"),
         },
     )
-    names = [f"{name}{whose}" for name in ("tremor_frequency", "tremor_width")]
-    assert list(result.found) == ["c_w", *names, "mean"]
+    names = [f"{name}{whose}" for name in ("resonance_frequency", "contraction_time")]
+    assert list(result.found) == ["c_w", *names, "model_mean"]
     rows = jm.fits.CohortResult({"a": result}, {}, {}).table()
-    assert [row["quantity"] for row in rows if row["quantity"] != "mean"] == ["c_w", *names]
+    of_model = [row["quantity"] for row in rows if row["kind"] == "model"]
+    assert [name for name in of_model if name != "model_mean"] == ["c_w", *names]
+    measured = [row["quantity"] for row in rows if row["kind"] == "measured"]
+    assert measured == list(result.measured) and len(rows) == len(measured) + len(of_model)
 
 
 def test_single_members_are_compared_by_their_standard_errors():
@@ -244,6 +249,17 @@ def test_single_members_are_compared_by_their_standard_errors():
         np.testing.assert_allclose(
             (d.low, d.high), np.array([-1, 1]) * 1.959964 * np.sqrt(2) * error, rtol=1e-6
         )
+
+
+def test_of_a_model_that_misses_the_data_only_what_is_measured_is_compared():
+    missed = Adequacy(145.0, 25.0, 0.001, "the data have more power than the model")
+    results = {"a": made_result(), "b": made_result(adequacy=missed)}
+    found = jm.fits.CohortResult(results, {"a": "one", "b": "two"}, {})
+    compared = {d.quantity for d in found.differences()}
+    # of a single member its own error is all there is: a variation that is stated once has none
+    sure = {n for n, m in results["a"].measured.items() if m.stderr is not None}
+    assert compared == sure and "median_frequency" in sure
+    assert {row["target"] for row in found.table() if row["quantity"] == "c_w"} == {"a", "b"}
 
 
 def test_one_bad_target_does_not_stop_the_rest(tmp_path):
@@ -318,7 +334,7 @@ def test_the_command_writes_a_folder_for_each_and_the_table(tmp_path):
         assert jm.load_result(out / name / "fit.json").success
         assert (out / name / "fit.png").stat().st_size > 0
     rows = (out / "cohort.csv").read_text().splitlines()
-    assert rows[0].startswith("target,group,quantity,value,stderr,low,high,unit,determined")
+    assert rows[0].startswith("target,group,quantity,kind,value,stderr,low,high,unit,determined")
     assert (
         (out / "differences.csv")
         .read_text()

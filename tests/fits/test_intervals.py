@@ -152,7 +152,7 @@ def lowest(levels, rises):
 def test_an_interval_ends_where_the_profile_does(task, segments, x64):
     """With the inverse curvature as covariance the root of the rise that is sought is 1.96, at
     either end."""
-    names = ["corner_frequency", "high_frequency_floor", "coefficient_of_variation"]
+    names = ["corner_frequency", "band_8_12", "model_coefficient_of_variation"]
     problem, objective, seen = fitted(task, drawn(task, segments, 3))
     value, theta = consequences(objective, seen).values[0], seen.theta + PLANE
     over_plane, rises = (

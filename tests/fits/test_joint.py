@@ -108,8 +108,8 @@ def test_two_force_levels_tell_what_one_does_not():
     names = (
         "corner_frequency",
         "harmonic_share",
-        "high_frequency_floor",
-        "coefficient_of_variation",
+        "band_8_12",
+        "model_coefficient_of_variation",
     )
     truth = (
         {f"{n}@low": low[n] for n in names}
@@ -118,9 +118,8 @@ def test_two_force_levels_tell_what_one_does_not():
     )
     assert_near_the_truth(joint.derived, truth, list(truth))
     assert abs(joint.parameters["harmonic_frequency"].value - 5.0) < 0.1 * BIN
-    assert (
-        set(joint.derived) >= {"K_w0", "mean@low", "mean@high"} and "K_w0@low" not in joint.derived
-    )
+    assert set(joint.derived) >= {"K_w0", "model_mean@low", "model_mean@high"}
+    assert "K_w0@low" not in joint.derived
     for name, part in joint.parts.items():
         assert part.chi2_per_bin < 1 + 4 * 0.31  # its standard deviation, see test_uncertainty
         assert float(part.task["P_w"]) == float(LEVELS[name]["P_w"])
@@ -145,17 +144,17 @@ def test_force_and_displacement_tell_every_stiffness_and_damping():
     assert all(alone[name].stderr is None for name in ("K_w0", "K_z0", "C_z0"))
     with jax.enable_x64(True):
         truth = dict(zip(determined, np.asarray(as_arrays(TRUTH).muscle.base()), strict=True))
-        truth["mean@force"] = true_derived(TRUTH)["mean"]
+        truth["model_mean@force"] = true_derived(TRUTH)["model_mean"]
         seen = true_derived(held)
     truth |= {
         f"{name}@displacement": seen[name]
-        for name in ("corner_frequency", "harmonic_share", "high_frequency_floor")
+        for name in ("corner_frequency", "harmonic_share", "band_8_12")
     }
     assert_near_the_truth(joint.derived, truth, list(truth))
     assert abs(joint.parameters["harmonic_frequency"].value - 5.0) < 0.1 * BIN
     assert joint.parameters["F_ext"].value == load  # only one task has it
     # little is known of it about a mean near zero
-    variation = joint.derived["coefficient_of_variation@displacement"]
+    variation = joint.derived["model_coefficient_of_variation@displacement"]
     assert variation.stderr is None or variation.stderr > 0.25 * variation.value
 
 
@@ -202,7 +201,7 @@ def test_a_second_equal_target_narrows_errors_by_the_root_of_two():
     names = [
         n
         for n, p in alone.derived.items()
-        if p.stderr is not None and n not in ("K_w0", "C_w0", "mean")
+        if p.stderr is not None and n not in ("K_w0", "C_w0", "model_mean")
     ]
     assert len(names) >= 5
     for name in names:
@@ -424,22 +423,35 @@ def test_a_result_holds_everything(quick):
         for i, target in enumerate(quick.parts):
             part = objective.parts[i]
             values = derived(task_at(part.task, part.coordinates, jnp.zeros(1)), seen.moments[i])
-            for name in ("corner_frequency", "mean", "high_frequency_floor"):
+            for name in ("corner_frequency", "model_mean", "band_8_12"):
                 assert quick.derived[f"{name}@{target}"].value == pytest.approx(float(values[name]))
     assert any(notice.startswith("fitted by the formula alone") for notice in quick.notices)
 
 
 def test_a_result_in_words(quick):
     text = str(quick)
-    assert text.startswith("The model describes the data: chi2 per bin ")
-    assert text.splitlines()[1] == "  together: low, high"
-    for expected_line in (
+    assert text.splitlines()[0] == "together: low, high"
+    in_order = (
+        "  measured of low, without the model:",
+        "  measured of high, without the model:",
+        "\nThe model describes the data: chi2 per bin ",
         "  low: low, Isometric, BandLimitedNoise, chi2 per bin 0.0",
-        "harmonic_amplitude@high",
+        "determined by the data",
         "corner_frequency@low",
-    ):
-        assert expected_line in text
+    )
+    places = [text.index(part) for part in in_order]
+    assert places == sorted(places) and "harmonic_amplitude@high" in text
     assert max(map(len, text.splitlines())) <= 125
+    assert "not determined: do not interpret" not in text
+    assert "the data do not determine: harmonic_amplitude@low, k_w@high" in text
+
+
+def test_what_is_measured_of_each_target_has_its_name(quick):
+    own = {n: target.measured for n, target in quick.targets.items()}
+    names = {f"{name}@{target}" for target, found in own.items() for name in found}
+    assert set(quick.measured) == names and "share_8_12@low" in names
+    assert all(target.measures for target in quick.targets.values())  # kept, so in its file
+    assert quick["share_8_12@high"] == own["high"]["share_8_12"]
 
 
 def test_what_is_saved_is_read_back_equal(quick, tmp_path):
@@ -478,7 +490,8 @@ def test_a_fit_that_fails_is_a_result(tmp_path):
     assert (
         not joint.success and "none of the starts gives a spectrum of every target" in joint.message
     )
-    assert str(joint).startswith("Not fitted: none of the starts gives a spectrum of every target")
+    said = "Not fitted: none of the starts gives a spectrum of every target"
+    assert any(line.startswith(said) for line in str(joint).splitlines())
     joint.save(tmp_path / "failed.json")
     assert_equal(jm.load_result(tmp_path / "failed.json"), joint)
     plt.close(joint.plot())
@@ -619,8 +632,10 @@ def test_two_targets_climb_together_and_their_aic_is_that_of_both(x64):
     rung = found.ladder[2]
     height = sum(float(jm.log_likelihood(part.task, part.target)) for part in found.parts.values())
     assert rung.aic == pytest.approx(2 * rung.parameters - 2 * height, abs=0.05)
-    assert abs(found["tremor_frequency"].value - float(truth["tremor_frequency"])) < 1.0
-    assert "with tremor instead of the harmonic the AIC falls by" in " ".join(str(found).split())
+    assert abs(found["resonance_frequency"].value - float(truth["resonance_frequency"])) < 1.0
+    assert "with a resonance instead of the harmonic the AIC falls by" in " ".join(
+        found.details().split()
+    )
     with pytest.raises(ValueError, match="rungs = 2: give at most 3, and no tasks"):
         jm.fit_joint(pair, rungs=2, tasks={name: jm.Isometric() for name in pair})
 

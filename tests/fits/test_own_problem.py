@@ -240,5 +240,6 @@ def test_results_summarise_themselves(result):
     assert str(summary) == repr(summary) == str(result) == repr(result)
     html = summary._repr_html_()
     # the other rows are per newton of it
-    shown = (result.found | result.parameters).keys() - {"mean"}
-    assert html.count("<tr>") == 1 + len(shown) and ">determined<" in html
+    shown = (result.found | result.parameters).keys() - {"model_mean"}
+    assert html.count("<tr>") == 1 + len(result.measured) + len(shown)
+    assert html.count(">measured<") == len(result.measured) and ">determined<" in html

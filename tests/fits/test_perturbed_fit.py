@@ -411,7 +411,7 @@ def test_a_published_response_alone(published):
     assert result.success and result.adequate and result.chi2_per_bin is None
     assert (
         result.target.bins.size == 0
-        and "mean" not in result.derived
+        and "model_mean" not in result.derived
         and "harmonic_frequency" not in result.free
     )
     for name, true in WHOLE.items():

@@ -26,7 +26,7 @@ from jaxmuscle.model._task_tables import task_from_table, task_to_table
 POWER = 1 / (1 + np.arange(1, 31) ** 2)
 TARGET = jm.Target(
     "made", POWER, segments=[6, 7], coefficient_of_variation=0.02, notices=["a notice"]
-)
+).with_measures()  # as a fit keeps it
 
 
 PART = [field.name for field in dataclasses.fields(jm.fits.FittedPart)]
@@ -62,9 +62,8 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "derived": {
             "corner_frequency": Estimate(1 / 3, "Hz", 0.01, interval=(0.31, None)),
             "K_w0": Estimate(200.0, "N/m", None, False, None),
-            "mean": Estimate(2.5, "N", None, True, False),
+            "model_mean": Estimate(2.5, "N", None, True, False),
         },
-        "products": ("k_w / c_w",),
         "correlation": {"parameters": ["k_w", "c_w"], "matrix": [[1.0, -0.5], [-0.5, 1.0]]},
         "undetermined": ("all stiffness and damping can be multiplied by one number",),
         "singular_values": np.array([12.0, 1 / 3]),
@@ -74,7 +73,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "harmonic_share": rng.uniform(0, 1, 30),
         "residual": rng.standard_normal(30),
         "deviation": rng.uniform(0.1, 0.3, 30),
-        "components": {"relaxation": rng.uniform(0, 1, 30), "tremor": rng.uniform(0, 1, 30)},
+        "components": {"relaxation": rng.uniform(0, 1, 30), "resonance": rng.uniform(0, 1, 30)},
         "ladder": (
             Rung(0, "base", -250.1, 6.5, 1.9, 0.002),
             Rung(1, "with activation", -260.0, 7.1, 0.9, 0.3, True),
@@ -122,9 +121,8 @@ def failed_result():
     return made_result(
         success=False,
         message="no start has a finite spectrum",
-        derived={"mean": Estimate(np.nan, "N")},
+        derived={"model_mean": Estimate(np.nan, "N")},
         adequacy=None,
-        products=(),
         further={},
         correlation={},
         undetermined=(),
@@ -189,10 +187,11 @@ def test_every_number_by_its_name():
 
 def test_the_numbers_of_several_targets_by_name():
     mean, other = Estimate(2.5, "N", 0.1), Estimate(3.5, "N", 0.2)
-    result = made_result(derived={"mean@a": mean, "mean@b": other})
-    assert result["mean@b"].value == 3.5
-    with pytest.raises(ValueError, match="quantity 'mean' of the fit of made: did you mean 'mean@"):
-        result["mean"]
+    result = made_result(derived={"model_mean@a": mean, "model_mean@b": other})
+    assert result["model_mean@b"].value == 3.5
+    unknown = "quantity 'model_mean' of the fit of made: did you mean 'model_mean@"
+    with pytest.raises(ValueError, match=unknown):
+        result["model_mean"]
 
 
 def test_a_result_as_a_table():
@@ -205,12 +204,28 @@ def test_a_result_as_a_table():
         "low",
         "high",
         "unit",
+        "error_from",
         "free",
         "determined",
     ]
-    assert (
-        set(table.index) == set(result.parameters) | set(result.derived) and table.index.is_unique
+    assert table.index.is_unique
+    assert set(table.index) == {*result.measured, *result.parameters, *result.derived}
+    count = len(result.measured)
+    assert list(table.index[:count]) == list(result.measured)
+    assert set(table["kind"][:count]) == {"measured"} and "measured" not in set(
+        table["kind"][count:]
     )
+    median = result.measured["median_frequency"]
+    columns = ["value", "stderr", "low", "high", "unit", "error_from", "free", "determined"]
+    assert list(table.loc["median_frequency", columns]) == [
+        median.value,
+        median.stderr,
+        *median.interval,
+        "Hz",
+        "bins",
+        False,
+        True,
+    ]
     assert list(table.loc["corner_frequency", ["kind", "value", "stderr", "low"]]) == [
         "derived",
         1 / 3,
@@ -219,7 +234,8 @@ def test_a_result_as_a_table():
     ]
     assert np.isnan(table["high"]["corner_frequency"]) and np.isnan(table["stderr"]["k_w"])
     assert list(table.loc["k_w", ["kind", "free", "determined"]]) == ["parameter", True, False]
-    assert set(table.index[table["determined"]]) == {"c_w", "corner_frequency"}
+    of_model = table[table["kind"] != "measured"]
+    assert set(of_model.index[of_model["determined"]]) == {"c_w", "corner_frequency"}
     bins = result.only.to_dataframe()
     np.testing.assert_array_equal(bins["fitted"], result.fitted)
     np.testing.assert_array_equal(bins["frequency_hz"], TARGET.frequency)
@@ -349,7 +365,7 @@ def test_json_refuses_what_it_has_no_word_for(tmp_path):
         ("", "fit.json: is empty"),
         (b"\xff\xfe\x00", "fit.json: is not UTF-8 text"),
         ("[1, 2]", "fit.json: holds no table, but a list"),
-        ("{}", f"is not a fit result of format 2 or 3 or {FORMAT}; write it with FitResult.save"),
+        ("{}", f"is not a fit result of format {FORMAT}: fit again, FitResult.save writes it"),
         (
             f'{{"format": {FORMAT}, "format": {FORMAT}}}',
             "is not valid JSON: the key 'format' is there twice",
@@ -357,6 +373,7 @@ def test_json_refuses_what_it_has_no_word_for(tmp_path):
         ('{"format": true}', "is not a fit result of format"),
         ('{"a": ' + "[" * 100_000, "fit.json: is nested too deeply"),
         ('{"format": 99}', "is not a fit result of format"),
+        (f'{{"format": {FORMAT - 1}}}', f"is not a fit result of format {FORMAT}: fit again"),
         (f'{{"format": {FORMAT}, "message": "m"}}', "the key '.*' is missing; needed are"),
     ],
 )
@@ -447,42 +464,6 @@ def test_a_result_that_contradicts_itself_is_refused(case, tmp_path):
     made_result().save(path)
     changed(path, key, value)
     with pytest.raises(ResultError, match=f"fit.json: {message}"):
-        jm.load_result(path)
-
-
-def test_a_result_of_the_format_before_is_read_without_loss(tmp_path):
-    """Format 2 left out what task and target do not have."""
-    path, result = tmp_path / "fit.json", made_result()
-    result.save(path)
-    table = json.loads(path.read_text())
-    table["format"] = 2
-    table["target_table"] = {
-        key: value for key, value in table["target_table"].items() if value is not None
-    }
-    del table["target_table"]["settings"]["tapers"], table["task_table"]["settings"]["tapers"]
-    del table["task_table"]["activation"], table["task_table"]["initial"]
-    path.write_text(json.dumps(table))
-    assert_equal(jm.load_result(path), result)
-    assert_equal(jm.load_preset(path), result.task)
-    table["format"] = FORMAT
-    path.write_text(json.dumps(table))
-    with pytest.raises(ResultError, match=r"has no key|is missing"):
-        jm.load_result(path)
-
-
-def test_a_result_of_format_3_does_not_say_where_its_starts_ended(tmp_path):
-    path, result = tmp_path / "fit.json", made_result()
-    result.save(path)
-    table = json.loads(path.read_text()) | {"format": 3}
-    for start in table["starts"]:
-        del start["values"]
-    path.write_text(json.dumps(table))
-    read = jm.load_result(path)
-    assert [(s.cost, s.values) for s in read.starts] == [(1.5, ()), (None, ())]
-    with pytest.raises(ValueError, match="does not say where its starts ended"):
-        jm.plot.start_values(read)
-    path.write_text(json.dumps(table | {"format": FORMAT}))
-    with pytest.raises(ResultError, match="has no key 'values'"):
         jm.load_result(path)
 
 

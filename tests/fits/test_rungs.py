@@ -132,14 +132,14 @@ def test_a_tremor_is_climbed_to_and_found():
     assert chosen.number == 2 and result.adequate
     assert [rung.number for rung in result.ladder] == [0, 1, 2] and result.ladder[0].p < 0.01
     assert chosen.aic == min(rung.aic for rung in result.ladder)
-    found = result.derived["tremor_frequency"]
+    found = result.derived["resonance_frequency"]
     assert found.stderr is not None and abs(found.value - 9.0) < 3 * found.stderr < 1.5
-    text = str(result)
-    assert "models tried" in text and "-> 2 with tremor instead of the harmonic" in text
+    text = result.details()
+    assert "models tried" in text and "-> 2 with a resonance instead of the harmonic" in text
     poorer, words = result.ladder[1], " ".join(text.split())
     assert (
-        f"with tremor instead of the harmonic the AIC falls by {poorer.aic - chosen.aic:.1f} (chi2"
-        " per bin" in words
+        "with a resonance instead of the harmonic the AIC falls by"
+        f" {poorer.aic - chosen.aic:.1f} (chi2 per bin" in words
     )
 
 
@@ -269,7 +269,7 @@ def test_a_slow_twitch_is_told_by_the_fit():
 def test_components_add_up_and_are_what_their_noise_alone_gives(x64):
     result = climbed()
     parts = result.only.components
-    assert set(parts) == {"relaxation", "floor", "harmonic", "tremor"}
+    assert set(parts) == {"relaxation", "floor", "harmonic", "resonance"}
     np.testing.assert_allclose(sum(parts.values()), 1.0, rtol=1e-9)
     task = result.task
     alone = task.replace(
@@ -283,7 +283,7 @@ def test_components_add_up_and_are_what_their_noise_alone_gives(x64):
         np.asarray(expected_moments(t, result.target.settings, WINDOW)[0].power)
         for t in (task, alone)
     )
-    np.testing.assert_allclose(parts["tremor"], own / whole, rtol=1e-9)
+    np.testing.assert_allclose(parts["resonance"], own / whole, rtol=1e-9)
 
 
 def test_half_power_frequency_against_a_root_of_the_transfer_function(x64):
@@ -353,10 +353,10 @@ def test_all_that_follows_a_fit_takes_a_model_with_tremor(tmp_path):
     told = jm.identifiability(
         result, designs=[design for design in same if design.lengthening is None]
     ).told
-    assert "tremor_frequency" in told and "resonance_frequency" not in told
+    assert "resonance_frequency" in told and "tremor_frequency" not in told
     with without_intervals():
         cohort = jm.fit_cohort([result.target], starts=8, rung=2)
     (found,) = cohort.results.values()
-    assert found.derived["tremor_frequency"].value == pytest.approx(
-        result.derived["tremor_frequency"].value, abs=0.2
+    assert found.derived["resonance_frequency"].value == pytest.approx(
+        result.derived["resonance_frequency"].value, abs=0.2
     )

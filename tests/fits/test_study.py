@@ -11,17 +11,19 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pages
 import pytest
-import scipy.stats
+import scipy
 from refits import without_intervals
 from test_result import made_result
 
 import jaxmuscle as jm
 from jaxmuscle.data._study_table import Cell
-from jaxmuscle.fits import Estimate, StudyResult
+from jaxmuscle.fits import Estimate, StudyResult, _study
+from jaxmuscle.fits._adequacy import Adequacy
 from jaxmuscle.fits._differences import corrected
 from jaxmuscle.fits._study import USUAL, _checked
 
 PEOPLE, CONDITIONS = 5, ("rest", "tired")
+REJECTED = Adequacy(60.0, 20.0, 0.001, "power from 4 to 6 Hz")
 OPTIONS = {
     "rung": "auto",
     "noise": None,
@@ -45,9 +47,9 @@ def values(seed=0):
     return found
 
 
-def made_study(numbers=None, left_out=(), **options):
-    """A study whose fits have these corner frequencies; those of `left_out` do not determine
-    them."""
+def made_study(numbers=None, left_out=(), rejected=(), **options):
+    """A study whose fits have these corner frequencies; those of `left_out` do not determine them,
+    those of `rejected` do not describe the data."""
     cells, results = [], {}
     rng = np.random.default_rng(3)
     for (person, group), both in (values() if numbers is None else numbers).items():
@@ -64,8 +66,12 @@ def made_study(numbers=None, left_out=(), **options):
             )
             error = None if name in left_out else 0.02
             other = Estimate(9 + value + 0.1 * rng.standard_normal(), "Hz", 0.5)
-            derived = {"corner_frequency": Estimate(value, "Hz", error), "tremor_frequency": other}
-            result = made_result(target=target, derived=derived)
+            more = {"adequacy": REJECTED} if name in rejected else {}
+            derived = {
+                "corner_frequency": Estimate(value, "Hz", error),
+                "resonance_frequency": other,
+            }
+            result = made_result(target=target, derived=derived, **more)
             cells.append(Cell(person, group, condition, 2, (100.0, 100.0), target))
             results[name] = result
     labels = {cell.target.name: f"{cell.group}, {cell.condition}" for cell in cells}
@@ -125,7 +131,22 @@ def test_what_a_fit_does_not_determine_is_left_out_and_counted():
     (within,) = of(study, "conditions")
     assert within.members == (2 * PEOPLE - 1,) * 2 and within.left_out == 1
     assert "left out" in str(study) and "selection" in study.methods()
-    assert "differences" not in str(made_study(left_out=[cell.target.name for cell in study.cells]))
+
+
+def test_the_numbers_of_a_rejected_model_are_left_out_and_what_is_measured_is_not():
+    names = ["corner_frequency", "median_frequency"]
+    study = made_study(rejected=("old1, tired",), quantities=names)
+    groups = {(d.quantity, d.where): d for d in of(study, "groups")}
+    assert groups["corner_frequency", "tired"].members == (PEOPLE, PEOPLE - 1)
+    assert groups["corner_frequency", "tired"].left_out == 1
+    assert groups["median_frequency", "tired"].members == (PEOPLE, PEOPLE)
+    assert groups["median_frequency", "tired"].left_out == 0
+    told = " ".join(str(study).split())
+    assert "it does not describe old1, tired, so the model's numbers of these are left out" in told
+    # what is measured is corrected by itself, whatever is compared beside it
+    alone = {d.where: d for d in of(made_study(quantities=names[1:]), "groups")}
+    for where in CONDITIONS:
+        assert groups["median_frequency", where].p_corrected == alone[where].p_corrected
 
 
 # Holm: 0.01 x 4, then the largest so far of 0.02 x 3, 0.03 x 2, 0.04 x 1; the p-values in another
@@ -148,8 +169,7 @@ def test_corrections(correction, expected):
 
 
 def test_every_kind_of_comparison_is_corrected_by_itself():
-    study = made_study(quantities=None)  # the derived ones; the parameter c_w is not among them
-    assert study.quantities == ("corner_frequency", "tremor_frequency")
+    study = made_study(quantities=["corner_frequency", "resonance_frequency"])
     for kind, count in (("groups", 4), ("conditions", 2), ("interaction", 2)):
         family = of(study, kind)
         assert len(family) == count
@@ -182,9 +202,9 @@ def test_tables():
 
 
 def test_a_quantity_is_asked_for_by_either_name():
-    asked = ["resonance_frequency", "tremor_frequency", "corner_frequency"]
+    asked = ["activation_time", "contraction_time", "corner_frequency"]
     assert _checked(USUAL | {"quantities": asked})["quantities"] == [
-        "tremor_frequency",
+        "contraction_time",
         "corner_frequency",
     ]
 
@@ -195,6 +215,7 @@ def test_the_folder(tmp_path):
     study.save(tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
+        "table1.csv",
         "people.csv",
         "differences.csv",
         "study.json",
@@ -214,7 +235,8 @@ def test_the_folder(tmp_path):
         and table["model"]["rung"] == 1
         and table["aic"] == {"0": 10.0, "1": -3.5}
     )
-    assert "nothing to compare" in str(made_study(alpha=0.05, quantities=["tremor_share"]))
+    told = str(made_study(quantities=["resonance_share"]))
+    assert "Comparisons of what is measured: none" in told
     methods = " ".join((tmp_path / "methods.txt").read_text().split())
     for said in (
         "10 people in 2 groups (young 5, old 5) in 2 conditions",
@@ -231,8 +253,9 @@ def test_the_folder(tmp_path):
 def test_a_study_without_differences_leaves_none_of_an_earlier_one(tmp_path):
     made_study().save(tmp_path)
     (tmp_path / "mine.csv").write_text("kept")
-    made_study(quantities=["tremor_share"]).save(tmp_path)
+    made_study(quantities=["resonance_share"]).save(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {
+        "table1.csv",
         "study.json",
         "methods.txt",
         "spectra.png",
@@ -283,7 +306,7 @@ def test_the_figure_of_spectra():
         ({"rung": "high"}, "rung = 'high'"),
         ({"alpha": 5.0}, "alpha = 5.0: give a share between 0 and 1"),
         ({"correction": "bonferoni"}, "correction = 'bonferoni': .*holm"),
-        ({"quantities": ["tremor"]}, "quantities: unknown 'tremor'; did you mean 'tremor_"),
+        ({"quantities": ["tremor"]}, "quantities: unknown 'tremor'; did you mean 'tremor_p'"),
     ],
 )
 def test_bad_options(options, message, recorded):
@@ -319,11 +342,97 @@ def recorded(tmp_path_factory):
     (folder / "study.csv").write_text(
         "\n".join(["file,person,group,condition,trial", *rows]) + "\n"
     )
+    (folder / "mixed.csv").write_text(
+        "file,person,units,rate\n0.npy,a,N,100\n1.npy,a,N,100\n4.npy,b,mN,100\n"
+    )
     (folder / "study.toml").write_text(
         'table = "study.csv"\nrate = 100.0\nunits = "N m"\nrung = 0\nquantities ='
         ' ["corner_frequency"]\n'
     )
     return folder
+
+
+def measure_by_scipy(trials):
+    """What Table 1 says of a person, by numpy and scipy alone, of the trials' samples."""
+    each = []
+    for x in trials:
+        mean, power = np.mean(x), scipy.fft.dct(x - np.mean(x), norm="ortho")[1:] ** 2 / len(x)
+        f = np.arange(1, len(x)) * 100.0 / (2 * len(x))
+        welch, p = scipy.signal.welch(x, 100.0, "hann", 256, 128, detrend="constant")
+        total = np.concatenate([[0], np.cumsum(p[1:31])])
+        each.append(
+            {
+                "mean": mean,
+                "standard_deviation": np.std(x),
+                "coefficient_of_variation": np.std(x) / mean,
+                "coefficient_of_variation_without_drift": np.std(scipy.signal.detrend(x)) / mean,
+                "relative_power_4_8": power[(f >= 4) & (f < 8)].sum() / mean**2,
+                "relative_power_8_12": power[(f >= 8) & (f < 12)].sum() / mean**2,
+                "power_0.5_1": power[(f >= 0.5) & (f < 1)].sum(),
+                "share_above_12": power[f >= 12].sum() / np.var(x),
+                "median_frequency": np.interp(total[-1] / 2, total, welch[1:32] - welch[1] / 2),
+                "sample_entropy": sample_entropy(x),
+            }
+        )
+    return {name: np.mean([one[name] for one in each]) for name in each[0]}
+
+
+def sample_entropy(x):
+    """-ln(A / B): pairs of templates of 2 samples within 0.2 σ, and those also alike in the
+    next."""
+    pairs = np.lib.stride_tricks.sliding_window_view(x, 3)
+    two = scipy.spatial.cKDTree(pairs[:, :2]).query_pairs(0.2 * np.std(x), np.inf)
+    alike = [i for i, k in two if abs(pairs[i, 2] - pairs[k, 2]) <= 0.2 * np.std(x)]
+    return -np.log(len(alike) / len(two))
+
+
+def test_table_1_is_what_scipy_says_of_the_same_samples(recorded):
+    study = jm.run_study(recorded / "study.toml", fit=False, quantities=["mean"])
+    assert not study.aic and study.success and "model" not in str(study)
+    rows = {(r["group"], r["condition"], r["quantity"]): r for r in study.table_1()}
+    files = dict(zip(((p, c) for p in "abcd" for c in CONDITIONS), range(0, 16, 2), strict=True))
+    for group, people in (("x", "ab"), ("y", "cd")):
+        for condition in CONDITIONS:
+            known = []
+            for person in people:
+                number = files[person, condition]
+                names = (recorded / f"{n}.npy" for n in (number, number + 1))
+                trials = [jm.load_recording(name, rate=100.0).steady() for name in names]
+                known.append(measure_by_scipy([trial.filtered() for trial in trials]))
+            for name in known[0]:
+                values, row = [one[name] for one in known], rows[group, condition, name]
+                np.testing.assert_allclose(
+                    (row["mean"], row["sd"]), (np.mean(values), np.std(values, ddof=1)), rtol=1e-9
+                )
+                assert (row["n"], row["people"]) == (2, 2)
+    told = str(study)
+    assert "Table 1: mean ± SD of people" in told and "tremor seen in" in told
+    assert "3 of conditions" not in told and "1 of conditions" in told
+    assert "A tremor from 6 to 12 Hz" in study.methods() and "rheological" not in study.methods()
+
+
+def test_all_recordings_of_a_study_have_one_unit(recorded):
+    with pytest.raises(ValueError, match=r"line 4: unit = 'mN' here, 'N' at .*line 2: give all in"):
+        jm.run_study(recorded / "mixed.csv")
+
+
+@pytest.mark.parametrize(("trials", "rung"), [(4, 2), (5, 3)])
+def test_five_trials_of_everybody_allow_two_resonances(trials, rung, recorded, monkeypatch):
+    power = 1 / np.arange(1, 31) ** 2
+    cells = [
+        Cell(name, "", "", count, (100.0,) * count, jm.Target(name, power, segments=5))
+        for name, count in (("a", 7), ("b", trials))
+    ]
+    asked = []
+
+    def fit_cohort(targets, **options):
+        asked.append(options["rung"])
+        return jm.fits.CohortResult({}, {}, {target.name: "not fitted" for target in targets})
+
+    monkeypatch.setattr(_study, "cells_of_study", lambda rows, usual: cells)
+    monkeypatch.setattr(_study, "fit_cohort", fit_cohort)
+    found = jm.run_study(recorded / "study.csv")
+    assert asked == [rung] and found.options["rung"] == rung
 
 
 @pytest.mark.slow

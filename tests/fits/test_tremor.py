@@ -34,14 +34,15 @@ def test_the_tremor_is_recovered():
     found = result()
     assert found.success and found.adequate and "PrescribedForce (acceleration)" in str(found)
     for name, true in (
-        ("tremor_frequency", 8.0),
-        ("tremor_width", 1.0),
+        ("resonance_frequency", 8.0),
+        ("resonance_width", 1.0),
         ("contraction_time", 0.06),
     ):
         q = found.derived[name]
         assert q.stderr is not None and abs(q.value - true) < 4 * q.stderr < 2 * true
-        assert name != "tremor_frequency" or q.stderr < 0.2  # half a bin
-    assert not {"mean", "coefficient_of_variation", "half_power_frequency"} & set(found.derived)
+        assert name != "resonance_frequency" or q.stderr < 0.2  # half a bin
+    about_zero = {"model_mean", "model_coefficient_of_variation", "half_power_frequency"}
+    assert not about_zero & set(found.derived)
     assert found.check["largest_deviation"] < 0.05  # linear response and simulation agree
 
 

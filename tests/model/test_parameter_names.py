@@ -45,19 +45,25 @@ def test_what_follows_from_parameters_can_be_read_only():
 
 
 def test_names_that_results_use_are_taken_too():
-    task = TREMOR.replace(tremor_frequency=7.0, contraction_time=0.05)
-    assert (
-        task["resonance_frequency"] == task.tremor_frequency == 7.0 and task.activation_time == 0.05
-    )
-    with pytest.raises(ValueError, match="tremor_width and resonance_width are the same parameter"):
-        TREMOR.replace(tremor_width=1.0, resonance_width=2.0)
+    task = TREMOR.replace(contraction_time=0.05)
+    assert task["activation_time"] == task.contraction_time == task.activation_time == 0.05
+    same = "contraction_time and activation_time are the same parameter"
+    with pytest.raises(ValueError, match=same):
+        TREMOR.replace(contraction_time=0.05, activation_time=0.06)
     options = FitOptions(
-        free=["tremor_width"],
-        priors={"tremor_width": 0.5},
+        free=["contraction_time"],
+        priors={"contraction_time": 0.5},
         bounds={"contraction_time": (0.01, 0.1)},
     )
-    assert options.free == ("resonance_width",) and options.priors == {"resonance_width": 0.5}
+    assert options.free == ("activation_time",) and options.priors == {"activation_time": 0.5}
     assert options.bounds == {"activation_time": (0.01, 0.1)}
+
+
+def test_a_tremor_is_measured_and_the_model_has_a_resonance():
+    """`tremor_frequency` is of the recording: no parameter has that name."""
+    for name in ("tremor_frequency", "tremor_width"):
+        with pytest.raises(ValueError, match=f"unknown parameter '{name}'"):
+            TREMOR.replace(**{name: 2.0})
 
 
 @pytest.mark.parametrize(

@@ -371,7 +371,7 @@ def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
         "relaxation": 0.7 * (1 - tremor),
         "floor": 0.3 * (1 - tremor),
         "harmonic": 0 * f,
-        "tremor": tremor,
+        "resonance": tremor,
     }
     task = on_rung(Isometric(), 2)
     found = result(
@@ -383,7 +383,7 @@ def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
     assert [label.partition(",")[0] for label in labels] == [
         "floor",
         "relaxation",
-        "tremor (all bins)",
+        "resonance (all bins)",
     ]
     assert sum(int(label.split(", ")[1].split()[0]) for label in labels) == pytest.approx(
         100, abs=2
@@ -403,7 +403,7 @@ def of_two_resonances(tremor, **changes):
     parts = {
         "relaxation": 0.9 * rest,
         "floor": 0.1 * rest,
-        "tremor": tremor + 0 * f,
+        "resonance": tremor + 0 * f,
         "resonance_2": second,
     }
     task = on_rung(Isometric(), 3).replace(
@@ -415,7 +415,7 @@ def of_two_resonances(tremor, **changes):
 def test_the_frequencies_of_resonances_are_marked_in_the_colours_of_their_parts():
     figure = plot.fit(of_two_resonances(0.2))
     linear, logarithmic, _, _ = panels(figure)
-    for label, where, color in (("tremor", 9.22, plot.GREEN), ("resonance 2", 3.7, plot.PURPLE)):
+    for label, where, color in (("resonance", 9.22, plot.GREEN), ("resonance 2", 3.7, plot.PURPLE)):
         name = f"{label} in the drive: {where:.2f} Hz"
         assert key(figure).count(name) == 1
         for ax in (linear, logarithmic):
@@ -439,11 +439,11 @@ def test_the_words_below_a_fit_of_two_resonances_find_room_in_its_width():
 
 @pytest.mark.parametrize(
     ("frequency", "share", "words"),
-    [(25.0, 0.2, ["tremor in the drive: 25.00 Hz"]), (9.22, 1e-6, [])],
+    [(25.0, 0.2, ["resonance in the drive: 25.00 Hz"]), (9.22, 1e-6, [])],
 )
 def test_a_tremor_outside_the_bins_or_without_power_is_not_marked_there(frequency, share, words):
     ax = panels(plot.fit(of_two_resonances(share, resonance_frequency=frequency)))[0]
-    marks = [line for line in ax.lines if str(line.get_label()).startswith("tremor in")]
+    marks = [line for line in ax.lines if str(line.get_label()).startswith("resonance in")]
     assert [line.get_label() for line in marks] == words
     assert all(np.size(line.get_xdata()) == 0 for line in marks)
 
@@ -694,7 +694,11 @@ def test_components_add_up_to_the_fit(log):
     f = result().frequency_hz
     tremor = np.where(np.abs(f - 9) < 1, 0.8, 0.0)
     found = result(
-        components={"relaxation": 0.7 * (1 - tremor), "floor": 0.3 * (1 - tremor), "tremor": tremor}
+        components={
+            "relaxation": 0.7 * (1 - tremor),
+            "floor": 0.3 * (1 - tremor),
+            "resonance": tremor,
+        }
     )
     ax = plot.components(found, log=log)
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
@@ -702,7 +706,7 @@ def test_components_add_up_to_the_fit(log):
     assert [part.partition(",")[0] for part in parts] == [
         "floor",
         "relaxation",
-        "tremor (all bins)",
+        "resonance (all bins)",
     ]
     if log:
         total = np.sum([np.nan_to_num(named(ax, part).get_ydata()) for part in parts], axis=0)
@@ -743,7 +747,7 @@ def cohort_of(people=6, bins=30, name="p", groups="ab"):
         about = {"target": target, "group": groups[i % len(groups)], "mvc_fraction": None}
         rows += [
             about | {"quantity": "corner_frequency", "value": 1.0 + i, "stderr": 0.1, "unit": "Hz"},
-            about | {"quantity": "band_0.5_1", "value": 0.1 * i, "stderr": 0.01, "unit": "1"},
+            about | {"quantity": "share_0.5_1", "value": 0.1 * i, "stderr": 0.01, "unit": "1"},
             about | {"quantity": "k_w", "value": 1.0, "stderr": None, "unit": "N/m^3"},
         ]
     named = {each: groups[i % len(groups)] for i, each in enumerate(results)}
@@ -762,7 +766,8 @@ def test_groups_have_a_mean_spectrum_and_their_numbers():
     np.testing.assert_allclose(edges, mean.get_ydata() * np.exp([[-1], [1]] * error), rtol=1e-9)
     assert (
         corner.get_ylabel() == "corner frequency\n(Hz)"
-        and share.get_ylabel().replace("\n", " ") == "power, 0.5 to 1\N{NO-BREAK SPACE}Hz (ratio)"
+        and share.get_ylabel().replace("\n", " ")
+        == "share of variance, 0.5 to 1\N{NO-BREAK SPACE}Hz (ratio)"
     )
     values = [line.get_ydata() for container in corner.containers for line in container.lines[:1]]
     np.testing.assert_array_equal(values, [[1, 3, 5], [2, 4, 6]])
@@ -919,8 +924,8 @@ def identified():
         "harmonic_frequency",
         "K_w0",
         "half_power_frequency",
-        "coefficient_of_variation",
-        "high_frequency_floor",
+        "model_coefficient_of_variation",
+        "band_8_12",
     ]
     names = [
         "the mean force, known to 2 %",
@@ -990,7 +995,7 @@ def judged(points=0):
 
 
 def refitted(
-    names=("corner_frequency", "high_frequency_floor", "coefficient_of_variation", "band_0.5_1"),
+    names=("corner_frequency", "band_8_12", "model_coefficient_of_variation", "band_0.5_1"),
 ):
     """Fifty refits that scatter as stated."""
     values = 1.0 + 0.1 * scipy.stats.norm.ppf((np.arange(50) + 0.5) / 50)
@@ -1307,7 +1312,7 @@ def test_the_drawing_has_the_numbers_of_the_task():
         ("C_", "8 N s/m"),
         ("P_", "7 N"),
         ("noise 15 %",),
-        ("tremor 1 % at 9 Hz",),
+        ("resonance 1 % at 9 Hz",),
         ("twitch of 0.08 s",),
     ):
         assert any(all(word in text for word in words) for text in said), words
@@ -1326,7 +1331,7 @@ def drawn_fit(**changes):
         "K_z0": estimate(314.0, "N/m", identifiable=False),
         "C_w0": estimate(114.3, "N s/m", 8.0),
         "C_z0": estimate(1.79, "N s/m", 0.12),
-        "mean": estimate(2.92, "N", 0.2),
+        "model_mean": estimate(2.92, "N", 0.2),
     } | changes
     parameters = {
         "noise_K_w": estimate(0.269, "1", 0.019),

@@ -1,8 +1,11 @@
 """The text of a fit, and its table in a notebook."""
 
+import functools
+
 import numpy as np
 import pytest
 from test_result import POWER, failed_result, made_result
+from test_steadiness import trials
 
 import jaxmuscle as jm
 from jaxmuscle.fits import Estimate
@@ -12,64 +15,96 @@ from jaxmuscle.reports._fit_text import _table, fit_card
 
 @pytest.mark.parametrize("whose", ["", "@a"])
 @pytest.mark.parametrize("free", [True, False])
-def test_a_tremor_is_listed_once_by_the_name_that_people_use(free, whose):
-    frequency = Estimate(9.0, "Hz", 0.2 if free else None, free, free or None)
+def test_what_is_parameter_and_derived_is_listed_once_by_the_name_that_people_use(free, whose):
+    tremor = Estimate(9.0, "Hz", 0.2 if free else None, free, free or None)
+    time = Estimate(0.05, "s", 0.01 if free else None, free, free or None)
     result = made_result(
         parameters={
-            f"resonance_frequency{whose}": frequency,
-            "harmonic_frequency": frequency,
+            f"resonance_frequency{whose}": tremor,
+            f"activation_time{whose}": time,
+            "harmonic_frequency": tremor,
             "m_w": Estimate(1.0, "kg"),
         },
         derived={
-            f"tremor_frequency{whose}": frequency,
-            "harmonic_frequency": frequency,
-            "mean": Estimate(2.5, "N"),
+            f"contraction_time{whose}": time,
+            f"resonance_frequency{whose}": tremor,
+            "harmonic_frequency": tremor,
+            "model_mean": Estimate(2.5, "N"),
         },
     )
-    kinds = result.to_dataframe().set_index("quantity")["kind"].to_dict()
-    assert kinds == {
-        "harmonic_frequency": "parameter",
-        "m_w": "parameter",
-        f"tremor_frequency{whose}": "parameter",
-        "mean": "derived",
-    }
+    table = result.to_dataframe()
+    kinds = table[table["kind"] != "measured"].set_index("quantity")["kind"].to_dict()
+    own = [f"contraction_time{whose}", f"resonance_frequency{whose}", "harmonic_frequency", "m_w"]
+    assert kinds == dict.fromkeys(own, "parameter") | {"model_mean": "derived"}
     names = [row[0] for row in fit_card(result).rows]
-    assert f"tremor_frequency{whose}" in names and f"resonance_frequency{whose}" not in names
-    assert result[f"resonance_frequency{whose}"] == frequency  # by either name
+    assert all(names.count(name) == 1 for name in own[:2])
+    assert f"activation_time{whose}" not in names
+    assert result[f"activation_time{whose}"] == result[f"contraction_time{whose}"] == time
 
 
 def test_the_table_of_a_failed_fit_has_numbers_in_its_columns_of_numbers():
     table = failed_result().to_dataframe()
     assert list(table.dtypes[["value", "stderr", "low", "high"]]) == [float] * 4
-    assert np.isnan(table.set_index("quantity")["value"]["mean"])
+    assert np.isnan(table.set_index("quantity")["value"]["model_mean"])
 
 
-def test_text_shows_what_is_known_and_what_is_not():
-    text = str(made_result())
-    first, second, *_ = text.splitlines()
-    assert first == "The model describes the data: chi2 per bin 0.90 (expected 0.86), p = 0.4"
-    assert second == "  made (user), Isometric, BandLimitedNoise, method montecarlo"
-    words = " ".join(text.split())
+PER_NEWTON = (
+    "stiffness and damping are stated here per newton of mean force. In fit.json (Python:"
+    " result['K_w0'], to_dataframe()) they are those of a model muscle that pulls with 2.5 N:"
+    " divide by 2.5 N"
+)
+VERDICT = "The model describes the data: chi2 per bin 0.90 (expected 0.86), p = 0.4"
+CONVERGED = "converged: 1 of 2 starts reach a fit as good as this (cost within 5 %)"
+
+
+def words_of(text):
+    return " ".join(text.split())
+
+
+def test_everything_shows_what_is_known_and_what_is_not():
+    words = words_of(made_result().details())
     for part in (
-        "converged: 1 of 2 starts reach a fit as good as this (cost within 5 %)",
+        VERDICT,
+        CONVERGED,
         "c_w 6.667 ± 0.013",  # 16.667 N over a mean of 2.5 N
         "corner_frequency 0.333 ± 0.010 above 0.31 Hz",
-        "though not each factor alone (jaxmuscle identifiability has values): k_w / c_w",
         "not determined: do not interpret these values (per newton of mean force): k_w",
         "the data leave open: - all stiffness and damping can be multiplied by one number",
-        (
-            "stiffness and damping are stated here per newton of mean force. In fit.json (Python:"
-            " result['K_w0'], to_dataframe()) they are those of a model muscle that pulls with 2.5"
-            " N: divide by 2.5 N"
-        ),
+        PER_NEWTON,
         "note: a notice",
     ):
         assert part in words
     assert words.index("determined by the data") < words.index("not determined: do not")
-    assert made_result()["c_w"].value / made_result()["mean"].value == pytest.approx(
+    assert made_result()["c_w"].value / made_result()["model_mean"].value == pytest.approx(
         6.667, abs=5e-4
     )
-    assert str(failed_result()).startswith("Not fitted: no start has a finite spectrum")
+
+
+def test_the_text_of_a_spectrum_is_short():
+    """What is measured, the verdict, the parameters, and what is not known."""
+    text = str(made_result())
+    first, second, *_ = text.splitlines()
+    assert first == "made (user), Isometric, BandLimitedNoise, method montecarlo"
+    assert second.split("  ") == ["", "measured, without the model:", *second.split("  ")[2:]]
+    words = words_of(text)
+    in_order = (
+        "coefficient of variation 2 %",
+        "median frequency",
+        VERDICT,
+        CONVERGED,
+        "2 trials, 13 Welch segments",
+        "note: a notice",
+        "parameters (per newton of mean force): c_w 6.667 ± 0.013",
+        "not determined, one of many sets that fit (per newton of mean force): k_w 2e+05",
+        PER_NEWTON,
+        "all other numbers of the model: `jaxmuscle fit --all`, fit.json; in Python"
+        " result.details()",
+    )
+    places = [words.index(part) for part in in_order]
+    assert places == sorted(places)
+    for absent in ("models tried", "AIC", "leave open", "corner_frequency", "do not interpret"):
+        assert absent not in words
+    assert words_of(str(failed_result())).count("Not fitted: no start has a finite spectrum") == 1
 
 
 def test_the_methods_paragraph_says_what_a_reader_needs_to_repeat_the_fit():
@@ -116,29 +151,28 @@ def test_text_counts_trials_and_segments_and_tells_how_much_the_trials_differ():
 def test_the_text_and_the_report_say_what_a_richer_model_gains():
     said = "with activation the AIC falls by 9.9 (chi2 per bin 0.90 instead of 1.90)"
     found = made_result()
-    assert f"  {said}" in str(found).splitlines() and said in found.summary().remarks
-    assert not any(
-        "AIC" in words
-        for words in (str(made_result(ladder=())), *made_result(ladder=()).summary().remarks)
-    )
+    assert f"  {said}" in found.details().splitlines() and said in found.summary().remarks
+    alone = made_result(ladder=())
+    assert not any("AIC" in words for words in (alone.details(), *alone.summary().remarks))
 
 
 def test_numbers_that_are_read_in_two_ways_are_said_in_both():
     """A variation also in percent; a share of the tremor with the frequency from which it
     counts."""
     derived = {
-        "tremor_frequency": Estimate(9.28, "Hz", 0.11),
-        "tremor_share": Estimate(0.0133, "1", 0.0033),
-        "coefficient_of_variation": Estimate(0.02013, "1", 0.00078),
+        "resonance_frequency": Estimate(9.28, "Hz", 0.11),
+        "resonance_share": Estimate(0.0133, "1", 0.0033),
+        "model_coefficient_of_variation": Estimate(0.02013, "1", 0.00078),
     }
-    text = str(made_result(derived=derived))
+    text = made_result(derived=derived).details()
     rows = {line.split()[0]: line for line in text.splitlines() if "±" in line}
-    assert rows["tremor_share"].endswith("0.0133 ± 0.0033")
-    assert "\n  tremor_share: counted from 4.6 Hz on, half of the tremor's frequency\n" in text
-    assert rows["coefficient_of_variation"].endswith("= 2.01 %")
-    assert rows["tremor_frequency"].endswith(" Hz")
-    alone = {"tremor_share": Estimate(0.0133, "1", 0.0033)}  # the frequency is not determined
-    assert not any(word in str(made_result(derived=alone)) for word in ("above", "counted from"))
+    assert rows["resonance_share"].endswith("0.0133 ± 0.0033")
+    assert "\n  resonance_share: counted from 4.6 Hz on, half of its frequency\n" in text
+    assert rows["model_coefficient_of_variation"].endswith("= 2.01 %")
+    assert rows["resonance_frequency"].endswith(" Hz")
+    alone = {"resonance_share": Estimate(0.0133, "1", 0.0033)}  # the frequency is not determined
+    text = made_result(derived=alone).details()
+    assert not any(word in text for word in ("above", "counted from"))
 
 
 def test_a_long_interval_is_set_apart_from_its_unit():
@@ -157,35 +191,131 @@ def test_an_interval_that_is_wider_than_its_error_says_is_to_be_stated():
         " State the interval"
     )
     for found in (wide, usual, half_open):
-        text = " ".join(str(made_result(derived={"half_power_frequency": found})).split())
+        text = words_of(made_result(derived={"half_power_frequency": found}).details())
         assert (words in text) == (found is wide)
 
 
-def test_a_fit_that_misses_the_data_says_so_first():
-    missed = Adequacy(
-        145.0,
-        25.0,
-        0.001,
-        "the data have more power than the model from 7 to 9 Hz (12.0 standard errors)",
-    )
-    found = made_result(adequacy=missed, chi2_per_bin=5.0)
-    first, *rest = str(found).splitlines()
+MISSED = Adequacy(
+    145.0,
+    25.0,
+    0.001,
+    "the data have more power than the model from 7 to 9 Hz (12.0 standard errors)",
+)
+
+
+def test_a_model_that_misses_the_data_prints_none_of_its_numbers():
+    """But what is measured, and of the model's numbers how many times their errors are widened."""
+    found = made_result(adequacy=MISSED, chi2_per_bin=5.0, harmonic_p_value=None)
     assert found.adequate is False and found.adequacy_p == 0.001
-    assert first.startswith(
-        "The model does not describe the data: chi2 per bin 5.00 (expected 0.86), p"
+    words = words_of(str(found))
+    in_order = (
+        "coefficient of variation 2 %",
+        "The model does not describe the data: chi2 per bin 5.00 (expected 0.86), p",
+        "so no number of the model is shown: report what is measured, and that the model",
+        f"their standard errors are widened by a factor of {np.sqrt(145 / 25):.2g}.",
     )
-    words = " ".join(" ".join(rest).split())
+    places = [words.index(part) for part in in_order]
+    assert places == sorted(places)
+    names = {*found.parameters, *found.derived}
+    assert not names & set(words.split()) and "Hz" not in words.partition("so no number")[2]
+    for absent in ("of the model (", "parameters", "do not determine", "AIC", "per newton"):
+        assert absent not in words
+    heading = "would be determined if the model held (per newton of mean force):"
+    assert heading in words_of(found.details()) and "c_w" in found.details().split()
+
+
+JUDGED = {
+    "describes": {},
+    "misses": {"adequacy": MISSED, "chi2_per_bin": 5.0},
+    "unknown": {"adequacy": None, "chi2_per_bin": None},
+    "failed": {"success": False, "adequacy": None, "chi2_per_bin": None},
+}
+VERDICTS = {
+    "describes": "The model describes the data",
+    "misses": "The model does not describe the data",
+    "unknown": "Whether the model describes the data cannot be judged",
+    "failed": "Not fitted: ",
+}
+MEASURED = (
+    "mean",
+    "standard deviation",
+    "coefficient of variation",
+    "  without a straight drift",
+    "median frequency",
+    "sample entropy",
+    "tremor, 6 to 12 Hz",
+    "  frequency",
+    "  size over the mean",
+)
+
+
+@functools.cache
+def recorded():
+    """One recording, its target, and what is measured of it."""
+    (held,) = trials(1)
+    return held.target(), jm.steadiness(held)
+
+
+def of_recordings(**changes):
+    target, _ = recorded()
+    settings = made_result().settings | {"spectrum": target.settings.to_dict()}
+    return made_result(target=target, settings=settings, **changes)
+
+
+@pytest.mark.parametrize("case", JUDGED)
+def test_what_is_measured_is_told_whatever_the_model_says(case, tmp_path):
+    """As steadiness prints it; no error is widened."""
+    found, (_, steady) = of_recordings(**JUDGED[case]), recorded()
+    rows = [line for line in str(steady).splitlines() if line.startswith(MEASURED)]
+    assert len(rows) == len(MEASURED)
+    for text in (str(found), found.details()):
+        lines = text.splitlines()
+        verdict = next(i for i, line in enumerate(lines) if line.startswith(VERDICTS[case]))
+        assert all(lines.index(f"    {row}") < verdict for row in rows)
+    found.save(tmp_path / "fit.json")
+    for result in (found, jm.load_result(tmp_path / "fit.json")):
+        assert result.measured == steady.measures
+        assert all(result[name] == m for name, m in steady.measures.items())
+    table = found.to_dataframe().set_index("quantity")
+    for name, m in steady.measures.items():
+        assert table.loc[name, "value"] == m.value and table.loc[name, "kind"] == "measured"
+        assert m.stderr is None or table.loc[name, "stderr"] == m.stderr
+
+
+def test_of_recordings_few_numbers_of_the_model_are_printed():
+    """The rhythms, the half-power frequency with what is known against it, the bands; and no
+    parameters, since one of several models was chosen for this target alone."""
+    derived = {
+        "resonance_frequency": Estimate(9.28, "Hz", 0.11, interval=(9.1, 9.5)),
+        "resonance_share": Estimate(0.0133, "1", 0.0033),
+        "half_power_frequency": Estimate(0.94, "Hz", 0.12, interval=(0.7, 1.2)),
+        "model_mean": Estimate(2.5, "N", None, True, False),
+        "band_8_12": Estimate(0.03, "1", 0.003),
+    }
+    text = str(of_recordings(derived=derived))
+    rows = [line.split()[:2] for line in text.splitlines()]
+    assert ["resonance_frequency", "9.28"] in rows and ["half_power_frequency", "0.94"] in rows
+    words = words_of(text)
     for part in (
-        f"errors are widened by a factor of {np.sqrt(145 / 25):.2g}",
-        "Not widened, since measured directly: coefficient of variation",
-        "what to do: do not interpret",
-        "would be determined if the model held (per newton of mean force):",
+        "of the model: 95 % interval",
+        "half_power_frequency: beside a strong tremor its interval is too narrow",
+        "power by band, fitted (measured): ",
+        "± is from within the recording",
+        "the model was chosen for this target alone",
+        "the data do not determine: k_w, model_mean",
     ):
         assert part in words
+    for absent in ("c_w", "resonance_share", "parameters", "per newton", "one of many sets"):
+        assert absent not in words
+    quiet = of_recordings(derived={"model_mean": derived["model_mean"]}, ladder=())
+    assert "of the model: 95" not in words_of(str(quiet)) and "chosen" not in str(quiet)
+
+
+def test_where_the_scatter_is_unknown_there_is_no_verdict_but_there_are_numbers():
     unknown = made_result(adequacy=None, chi2_per_bin=None)
-    assert unknown.adequate is None and "the data cannot be judged: the target" in " ".join(
-        str(unknown).split()
-    )
+    words = words_of(str(unknown))
+    assert unknown.adequate is None and "the data cannot be judged: the target" in words
+    assert "parameters (per newton of mean force): c_w" in words
 
 
 def test_text_fits_a_terminal():

@@ -18,8 +18,8 @@ def test_every_part_of_the_chosen_model_says_what_it_gains_over_the_poorer_one()
     assert said[:-1] == (
         "with activation the AIC falls by 50.0 (chi2 per bin 4.00 instead of 9.00)",
         (
-            "with tremor instead of the harmonic the AIC rises by 0.5 (chi2 per bin 4.05 instead of"
-            " 4.00)"
+            "with a resonance instead of the harmonic the AIC rises by 0.5 (chi2 per bin 4.05"
+            " instead of 4.00)"
         ),
     )
     assert "A richer model can fit worse here" in said[-1]
@@ -35,7 +35,7 @@ def test_what_a_part_gains_is_counted_from_the_best_model_without_it():
     assert worse[:-1] == (
         "with activation the AIC rises by 10.0 (chi2 per bin 5.00 instead of 4.00)",
         (
-            "with tremor instead of the harmonic the AIC falls by 30.0 against the best model"
+            "with a resonance instead of the harmonic the AIC falls by 30.0 against the best model"
             " before (0) (chi2 per bin 1.00 instead of 4.00)"
         ),
     )
@@ -56,7 +56,7 @@ def test_a_model_that_is_missing_in_the_table_is_explained():
 def test_what_was_not_tried_is_counted_with_the_next_model():
     gain, _ = gain_sentences(tried((0, -10.0), (2, -60.0), chosen=2), describes=True)
     assert gain.startswith(
-        "with activation and with tremor instead of the harmonic the AIC falls by 50.0 ("
+        "with activation and with a resonance instead of the harmonic the AIC falls by 50.0 ("
     )
     gain, _ = gain_sentences(tried((-1, -10.0), (0, -20.0), chosen=0), describes=True)
     assert gain.startswith("with a harmonic the AIC falls by 10.0 (")

@@ -15,6 +15,7 @@ from jaxmuscle._common.figures import pixels_of
 from jaxmuscle.commands import cohort as cohort_command
 from jaxmuscle.commands.console import write_fit
 from jaxmuscle.reports import fit_report, posterior_report, study_report
+from jaxmuscle.reports._study_text import difference_in_words
 
 
 @pytest.fixture(autouse=True)
@@ -112,8 +113,10 @@ def test_of_a_study(tmp_path):
     study_report(study, tmp_path)
     text, _ = told(tmp_path)
     smallest = min(study.differences(), key=lambda d: (d.p_corrected, d.p))
-    cells = ("p corrected", smallest.quantity, smallest.where, f"{smallest.b} - {smallest.a}")
-    assert " | ".join(filter(None, cells)) in text  # the clearest first
+    said, number = difference_in_words(smallest)
+    assert f"people | {said} | {number} | {smallest.p:.2g}" in text  # the clearest first
+    assert f"{smallest.quantity}, change {smallest.where}: {smallest.b} - {smallest.a}" == said
+    assert "Table 1: mean ± SD of people | young, rest | young, tired | old, rest" in text
     assert study.methods() in text and "people.csv and differences.csv" in text
 
 

@@ -12,6 +12,7 @@ from test_scaling import moments
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import PresetError
+from jaxmuscle.fits._fit_file import FORMAT
 from jaxmuscle.model._task_tables import task_to_table
 from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
 
@@ -93,6 +94,9 @@ def test_a_fit_json_holds_the_fitted_newtons(tmp_path):
     path.write_text(json.dumps(table))
     assert jm.load_result(path).only.target.mean_force[0] == 99.0
     assert_equal(jm.load_preset(path), result.task)
+    path.write_text(json.dumps(table | {"format": FORMAT - 1}))
+    with pytest.raises(PresetError, match=f"format = {FORMAT - 1}: is not a fit.json of format"):
+        jm.load_preset(path)
 
 
 WRONG = {

@@ -180,9 +180,12 @@ def test_what_follows_from_the_spectrum_depends_on_the_masses_too(x64):
     task = jm.Isometric(settings=jm.SpectrumSettings(filter_direction="both")).replace(**VALUES)
     made = Experiment.of(fitted(task), ("K_w0",), Lengthening.flat(1e-3, (0.5, 5.0), SECONDS), None)
     names = made.here.coordinates.names
+    # how much of every bin lies between 8 and 12 Hz
+    f, width = task.settings.frequency, task.settings.resolution
+    highest = np.clip((12 - f) / width + 0.5, 0, 1) - np.clip((8 - f) / width + 0.5, 0, 1)
     for name, read in {
-        "coefficient_of_variation": lambda m: np.sqrt(m.variance) / m.mean,
-        "high_frequency_floor": lambda m: m.proportional[-10:].mean(),
+        "model_coefficient_of_variation": lambda m: np.sqrt(m.variance) / m.mean,
+        "band_8_12": lambda m: highest @ m.proportional,
     }.items():
         expected = by_differences(task, read, free=("m_w", "m_z"))
         sd = [jm.model.PARAMETERS[n].prior_sd for n in ("m_w", "m_z")]
@@ -498,12 +501,12 @@ def test_a_wider_band_is_told_of_where_it_tells_more():
 
 
 def test_a_quantity_of_several_targets_has_its_plain_name():
-    known = {"K_z0": 1.0, "K_w_tangent@held": 1.0, "K_w_tangent@moved": 1.0, "mean@held": 1.0}
+    known = {"K_z0": 1.0, "K_w_tangent@held": 1.0, "K_w_tangent@moved": 1.0, "model_mean@held": 1.0}
     assert _named("K_w_tangent", known, [None, "moved", "held"]) == "K_w_tangent@moved"
     assert _named("K_w_tangent", known, ["held", "moved"]) == "K_w_tangent@held"
-    assert [_named(n, known, [None, "moved", "held"]) for n in ("K_z0", "mean", "K")] == [
+    assert [_named(n, known, [None, "moved", "held"]) for n in ("K_z0", "model_mean", "K")] == [
         "K_z0",
-        "mean@held",
+        "model_mean@held",
         "K",
     ]
 

@@ -143,9 +143,7 @@ def test_information_adds_up(x64):
     np.testing.assert_allclose(
         found.present.singular_values**2, np.linalg.eigvalsh(whole)[::-1], rtol=1e-8
     )
-    assert {"high_frequency_floor@low", "high_frequency_floor@high", "C_w0"} <= set(
-        found.present.quantities
-    )
+    assert {"band_8_12@low", "band_8_12@high", "C_w0"} <= set(found.present.quantities)
     # A force level beyond each end, and of each target a longer recording.
     levels = [design.name for design in found.designs if "force level" in design.name]
     assert levels == [

@@ -264,7 +264,7 @@ def test_readme(readme):
         and mine.success
         and abs(mine.parameters["harmonic_frequency"].value - 6.0) < 0.25 * 0.390625
     )
-    variation = mine.derived["coefficient_of_variation"]
+    variation = mine.derived["model_coefficient_of_variation"]
     # A fourth trial of the same person, known to √3 times the error of the mean of three.
     (fourth,) = names["recording"].steady().target().coefficient_of_variation
     assert variation.stderr is not None and abs(variation.value - fourth) < 4 * 2 * variation.stderr
@@ -310,13 +310,13 @@ def test_tutorial_and_front_page():
     names = pages.run("docs/tutorial.md", {}, few)
     assert "harmonic_frequency" in names["sharper"].free and jm.load_result("mine.json").success
     assert pages.run("docs/index.md", {}, {"seeds=1000)": "seeds=100)"})["result"].success
-    reported = pages.run("docs/how-to/report-results.md")["determined"]
+    reported = pages.run("docs/how-to/report-results.md")["reported"]
     assert {"corner_frequency", "coefficient_of_variation"} <= set(reported["quantity"]) and Path(
         "table.csv"
     ).exists()
     few = {"mean_force=(40.5, 0.8)": f"mean_force=(40.5, 0.8), {FEW}"}
     assert pages.run("docs/fitting.md", {}, few)["in_newtons"].derived[
-        "mean"
+        "model_mean"
     ].value == pytest.approx(40.5, abs=3 * 0.8)
 
 
@@ -546,7 +546,7 @@ def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(in_python
                 "tasks=pair)", f"tasks=pair, {few})"
             )
             # this profile is there
-            made = eval(code.replace("high_frequency_floor", "corner_frequency"), names)
+            made = eval(code.replace("band_8_12", "corner_frequency"), names)
             whole = getattr(made[0] if isinstance(made, tuple) else made, "figure", made)
             assert not list(unlabelled(whole)), figure.file
             plt.close("all")

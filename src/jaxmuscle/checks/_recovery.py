@@ -227,17 +227,17 @@ class Bootstrap(Printed, Result, eqx.Module):
     def __str__(self) -> str:
         done = self.replicates - len(self.failed)
         lines = [f"{self.target}: {done} refits of data made from the fit"]
-        wide = max(24, *(1 + len(name) for name in self.quantities)) if self.quantities else 24
+        wide = max([24, *map(len, self.quantities)])
         lines.append(
-            f"  {'':<{wide}}{'true':>9} {'stated':>8} {'spread/stated':>14} {'bias':>9}"
+            f"  {'':<{wide}} {'true':>8} {'stated':>7} {'spread/stated':>13} {'bias':>7}"
             f" {'in 95 %':>7}"
         )
         for q in self.quantities.values():
             share = "-" if math.isnan(q.coverage) else f"{100 * q.coverage:.0f} %"
-            mark = "" if q.verdict == "holds" else " *"
+            mark = "" if q.verdict == "holds" else "*"
             lines.append(
-                f"  {q.name:<{wide}}{q.true:>9.4g} {q.stated:>8.2g} {q.ratio:>7.2f} ±"
-                f" {q.ratio_stderr:<4.2f} {q.bias:>9.1g} {share:>7}{mark}"
+                f"  {q.name:<{wide}} {q.true:>8.4g} {q.stated:>7.2g} {q.ratio:>6.2f} ±"
+                f" {q.ratio_stderr:<4.2f} {q.bias:>7.1g} {share:>7}{mark}"
             )
         return "\n".join([*lines, folded(f"- {sentence}" for sentence in self.sentences)])
 

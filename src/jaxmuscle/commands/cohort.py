@@ -37,7 +37,6 @@ SHOWN = {
     "harmonic_frequency": "harmonic (Hz)",
     "corner_frequency": "corner (Hz)",
     "harmonic_share": "harmonic\nshare",
-    "high_frequency_floor": "floor",
 }
 CHI2 = (
     "chi² per bin: squared distance of spectrum and fit in standard deviations, mean over the bins"
@@ -160,7 +159,8 @@ def _row(difference: Any) -> dict[str, Any]:
         name: getattr(difference, name)
         for name in ("quantity", "a", "b", "difference", "low", "high", "unit", "basis")
     }
-    return row | {"members_a": difference.members[0], "members_b": difference.members[1]}
+    members = {"members_a": difference.members[0], "members_b": difference.members[1]}
+    return row | members | {"left_out": difference.left_out}
 
 
 def _columns(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:

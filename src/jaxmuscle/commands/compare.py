@@ -70,8 +70,8 @@ def compare(
     can be told apart.
 
     Each colour is fitted with and without a harmonic (a regular rhythm). The richer models have
-    activation or tremor. Writes DIR/compare.csv, DIR/compare.json and DIR/compare.png, and prints
-    the table. A model that is impossible in this task is left out, and you are told why.
+    activation or resonance. Writes DIR/compare.csv, DIR/compare.json and DIR/compare.png, and
+    prints the table. A model that is impossible in this task is left out, and you are told why.
 
     Examples:
 

@@ -94,9 +94,8 @@ def fit(
             min=0,
             max=3,
             help=(
-                "Richest model that may be tried: 0 base, 1 with activation, 2 with tremor, 3 with"
-                " a second resonance. "
-                "If you give several spectra, all get exactly this model."
+                "Richest model that may be tried: 0 base, 1 with activation, 2 with a resonance, 3"
+                " with a second one. If you give several spectra, all get exactly this model."
             ),
         ),
     ] = None,
@@ -106,8 +105,8 @@ def fit(
             min=0,
             max=3,
             help=(
-                "Fit just this model: 0 base, 1 with activation, 2 with tremor, 3 with a second"
-                " resonance."
+                "Fit just this model: 0 base, 1 with activation, 2 with a resonance, 3 with a"
+                " second one."
             ),
         ),
     ] = None,
@@ -188,6 +187,16 @@ def fit(
             help=(
                 "Leave out the simulated check, the harmonic's profile and p-value, figure and"
                 " report."
+            ),
+        ),
+    ] = False,
+    everything: Annotated[
+        bool,
+        typer.Option(
+            "--all",
+            help=(
+                "Print all numbers of the model, too: parameters, what the data do not determine,"
+                " the models that were tried."
             ),
         ),
     ] = False,
@@ -299,7 +308,7 @@ def fit(
             if rung is not None:
                 bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
                 options["tasks"] = {name: jm.on_rung(base, rung) for name, base in bases.items()}
-            converged = _fit_with_holds(*given, output, options, figures)
+            converged = _fit_with_holds(*given, output, options, figures, everything=everything)
         else:
             options |= {
                 "method": str(method),
@@ -315,7 +324,7 @@ def fit(
             writable(output, "fit.json", force=force, reads=target)
             if rung is not None:
                 model = jm.on_rung(model, rung)
-            converged = _fit_alone(seen, model, output, options, figures)
+            converged = _fit_alone(seen, model, output, options, figures, everything=everything)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
@@ -348,7 +357,7 @@ def _check_rung(
         )
     if rung and noise is not None:
         raise ValueError(
-            "--rung: the models with activation and tremor have noise of their own; leave out"
+            "--rung: the models with activation and resonance have noise of their own; leave out"
             " --noise"
         )
 
@@ -405,18 +414,31 @@ def _aim_at_spectrum(
 
 
 def _fit_alone(
-    seen: Any, model: Any, folder: Path, options: dict[str, Any], formats: list[str]
+    seen: Any,
+    model: Any,
+    folder: Path,
+    options: dict[str, Any],
+    formats: list[str],
+    *,
+    everything: bool,
 ) -> bool:
     """One spectrum, or the recordings of one condition."""
 
     def fitted(tell: Any, answer: Any) -> Any:
         return jm.fit(model, seen, progress=tell, answer=answer, **options)
 
-    return _fit_one(fitted, seen[0].name if isinstance(seen, list) else seen.name, folder, formats)
+    called = seen[0].name if isinstance(seen, list) else seen.name
+    return _fit_one(fitted, called, folder, formats, everything=everything)
 
 
 def _fit_with_holds(
-    moved: Any, held: Any, folder: Path, options: dict[str, Any], formats: list[str]
+    moved: Any,
+    held: Any,
+    folder: Path,
+    options: dict[str, Any],
+    formats: list[str],
+    *,
+    everything: bool,
 ) -> bool:
     """Records of a moved and of a held insertion."""
 
@@ -425,16 +447,25 @@ def _fit_with_holds(
             {"moved": moved, "held": held.target()}, progress=tell, answer=answer, **options
         )
 
-    return _fit_one(fitted, "the moved and the held record", folder, formats)
+    called = "the moved and the held record"
+    return _fit_one(fitted, called, folder, formats, everything=everything)
 
 
-def _fit_one(fit: Callable[[Any, Any], Any], called: str, folder: Path, formats: list[str]) -> bool:
+def _fit_one(
+    fit: Callable[[Any, Any], Any],
+    called: str,
+    folder: Path,
+    formats: list[str],
+    *,
+    everything: bool,
+) -> bool:
     """The table as soon as the search has ended, then what the checks add; the fit is written
     before these."""
     printed = []
 
     def table(result: Any) -> None:
-        show(result, success=result.success and result.adequate is not False)
+        text = result.details() if everything else result
+        show(text, success=result.success and result.adequate is not False)
         printed.append(result)
 
     def answer(result: Any) -> None:

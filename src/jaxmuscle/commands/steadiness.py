@@ -10,6 +10,7 @@ import jaxmuscle as jm
 from .console import out, plain, record, reporting, writable
 from .options import Force, Formats, Json, Output, Recordings, Window, band_of, formats_of
 from .recordings import read_trials, reads_recordings
+from .study import measured_study, write_study
 
 
 @reads_recordings
@@ -33,18 +34,32 @@ def steadiness(
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """How steady is a force? Variability, power by band, regularity of one or several trials,
-    without a model.
+    """How steady is a force? Variability, power by band, tremor, regularity of one or several
+    trials, without a model; or of all people of a study.
 
     Give the trials of one person in one condition. Prints every value with its standard error and
     95 % interval. From three trials on, they follow from how much the trials differ. Writes
     DIR/steadiness.json, DIR/steadiness.csv (a row per trial and quantity) and DIR/steadiness.png.
 
-    Example:
+    Or give the table of a study (`jaxmuscle study` says what it holds). Prints Table 1 of a paper,
+    mean and SD by group and condition, and what differs. Writes what `jaxmuscle study` writes, but
+    for the fits.
+
+    Examples:
 
         jaxmuscle steadiness trial1.csv trial2.csv --column force --rate 2048 --window 8:25
+
+        jaxmuscle steadiness study.csv --out out/study
     """
     with reporting(as_json):
+        if len(paths) == 1 and jm.data.is_study(paths[0]):
+            if band is not None:
+                raise ValueError(
+                    "--band: of a study leave it out; the band is that of the quantity"
+                )
+            found = measured_study(paths[0], window, reading, output, force=force)
+            write_study(found, output, formats_of(formats))
+            return
         from jaxmuscle._common.figures import write_figure
         from jaxmuscle._common.files import write_text
 
@@ -52,7 +67,7 @@ def steadiness(
         searched = None if band is None else band_of(band)
         found = jm.steadiness(read_trials(paths, reading, window), band=searched)
         found.save(output / "steadiness.json")
-        table = found.to_dataframe().to_csv(index=False, float_format="%.8g", lineterminator="\n")
+        table = found.to_dataframe().to_csv(index=False, float_format="%.12g", lineterminator="\n")
         write_text(output / "steadiness.csv", table)
         figures = write_figure(found.plot(), output, "steadiness", formats_of(formats))
         record(output / "steadiness.json")

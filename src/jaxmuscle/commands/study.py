@@ -1,7 +1,7 @@
 """`jaxmuscle study`."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,6 +23,9 @@ from .options import (
 )
 from .recordings import edges_of, reads_recordings
 
+if TYPE_CHECKING:
+    from jaxmuscle.fits import StudyResult
+
 
 @reads_recordings
 def study(
@@ -37,9 +40,9 @@ def study(
         str | None,
         typer.Option(
             help=(
-                "Model for all people: 0 base, 1 with activation, 2 with tremor (default), 3 with a"
-                " second resonance; or "
-                "auto: the one with the lowest AIC."
+                "Model for all people: 0 base, 1 with activation, 2 with a resonance, 3 with a"
+                " second one; or auto: the one with the lowest AIC. By default 3 where everybody"
+                " has five trials in every condition, else 2."
             )
         ),
     ] = None,
@@ -75,24 +78,26 @@ def study(
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """Compare groups and conditions: fit all recordings of a study with one model, write tables,
-    figures and methods.
+    """Compare groups and conditions: measure all recordings of a study, fit them with one model,
+    write tables, figures and methods.
+
+    Prints Table 1 (mean and SD of what is measured, by group and condition), then what differs,
+    then the model. `jaxmuscle steadiness` with the same table does the first part alone.
 
     The table has a line for each recording. It needs the columns file and person, and may have
     group, condition and trial. The trials of a person in a condition are averaged. Options such as
     --column say how files are read. A column of the same name in the table has priority. Writes
-    DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png, methods.txt and
-    report.html, all at the end.
+    DIR/table1.csv, people.csv, differences.csv, study.json, spectra.png, quantities.png,
+    methods.txt and report.html, all at the end.
 
     Examples:
 
         jaxmuscle study study.csv --out out/study
 
-        jaxmuscle study study.toml --correction fdr --quantities tremor_frequency,tremor_share
+        jaxmuscle study study.toml --correction fdr --quantities mean,tremor_frequency
     """
     with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
-        from jaxmuscle.reports import study_report
 
         keep_compiled_programs()
         span = edges_of(window)
@@ -108,19 +113,40 @@ def study(
             progress=True,
             window=span,
             spectrum=None if spectrum is None else str(spectrum),
-            **{name: value for name, value in reading.items() if value != READING[name][1]},
+            **_given(reading),
         )
-        whose: dict[str, list[str]] = {}
-        for cell in found.cells:
-            for notice in cell.target.notices:
-                whose.setdefault(notice, []).append(cell.target.name)
-        for notice, names in whose.items():
-            said = "all" if len(names) == len(found.cells) else "; ".join(names)
-            err.print(f"[yellow]notice:[/] {plain(said)}: {plain(notice)}", highlight=False)
-        found.save(output, formats_of(formats))
-        study_report(found, output)
-        record(output / "study.json")
-        show(found, success=found.success)
-        files = ", ".join(sorted(path.name for path in output.iterdir()))
-        out.print(f"Written: {output}/{files}", highlight=False, soft_wrap=True)
+        write_study(found, output, formats_of(formats))
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)
+
+
+def write_study(found: "StudyResult", output: Path, formats: list[str]) -> None:
+    """Say what is to be noticed of its recordings, write it, and print it."""
+    from jaxmuscle.reports import study_report
+
+    whose: dict[str, list[str]] = {}
+    for cell in found.cells:
+        for notice in cell.target.notices:
+            whose.setdefault(notice, []).append(cell.target.name)
+    for notice, names in whose.items():
+        said = "all" if len(names) == len(found.cells) else "; ".join(names)
+        err.print(f"[yellow]notice:[/] {plain(said)}: {plain(notice)}", highlight=False)
+    found.save(output, formats)
+    study_report(found, output)
+    record(output / "study.json")
+    show(found, success=found.success)
+    files = ", ".join(sorted(path.name for path in output.iterdir()))
+    out.print(f"Written: {output}/{files}", highlight=False, soft_wrap=True)
+
+
+def measured_study(
+    table: str, window: str | None, reading: dict[str, Any], output: Path, *, force: bool
+) -> "StudyResult":
+    """A study without any model."""
+    span = edges_of(window)
+    writable(output, "study.json", force=force)
+    return jm.run_study(table, fit=False, progress=True, window=span, **_given(reading))
+
+
+def _given(reading: dict[str, Any]) -> dict[str, Any]:
+    """The options of reading that were given."""
+    return {name: value for name, value in reading.items() if value != READING[name][1]}

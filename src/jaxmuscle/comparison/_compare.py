@@ -55,12 +55,12 @@ def compare_noise(  # noqa: PLR0913 (options of a public call)
         print(jm.compare_noise(jm.task_for(target), target))
 
     The richer models that a fit may climb to (`on_rung`) are compared, too, with the task's own
-    noise: "activation", "tremor" instead of the harmonic, "two resonances".
+    noise: "activation", "resonance" instead of the harmonic, "two resonances".
 
     Each model is climbed, in linear response, to the highest of the maxima of its posterior from 64
-    starting points (16 without harmonic). For a model with a resonance ("tremor", "two resonances")
-    a third of the searches begin, in the parameters that both have, where that of a simpler model
-    of the task's own noise ended, of several the one with the lowest AIC. There
+    starting points (16 without harmonic). For a model with a resonance ("resonance", "two
+    resonances") a third of the searches begin, in the parameters that both have, where that of a
+    simpler model of the task's own noise ended, of several the one with the lowest AIC. There
 
         AIC = -2 ln L + 2 p,    p = tr(F (F + Λ)⁻¹),
 
@@ -76,7 +76,7 @@ def compare_noise(  # noqa: PLR0913 (options of a public call)
     - `task`: whose own noise keeps its values while the others take their defaults
     - `target`: what is fitted, as in `fit`
     - `noises`: names of colours ("white", "band-limited", "ornstein-uhlenbeck", "pink") and of
-      richer models ("activation", "tremor", "two resonances"); by default all of them
+      richer models ("activation", "resonance", "two resonances"); by default all of them
     - `free`, `fix`, `priors`, `bounds`: as in `fit`, those of a parameter that one model has and
       another has not for those that have it
     - `groups`
@@ -202,7 +202,7 @@ def _poorer(
         for (name, _), values in found.items()
         if RICHER.get(name, 0) < rung and (name in RICHER or NOISES[name] is type(task.noise))
     ]
-    if rung < RICHER["tremor"] or not poorer:
+    if rung < RICHER["resonance"] or not poorer:
         return None
     ended = min(poorer, key=lambda values: values["aic"] if np.isfinite(values["aic"]) else np.inf)[
         "task"

@@ -256,7 +256,9 @@ class Comparison(Printed, Result, eqx.Module):
         if self.harmonic is not None:
             asked = any(row.harmonic for row in self.rows if row.noise == first)
             said.append(
-                str(self.harmonic) if asked else f"among the models without tremor, {self.harmonic}"
+                str(self.harmonic)
+                if asked
+                else f"among the models without resonance, {self.harmonic}"
             )
         if self.best.scores is None:
             said.append(

@@ -8,13 +8,15 @@ import equinox as eqx
 import numpy as np
 import scipy
 
+from jaxmuscle._common.cards import Card, Shown
+from jaxmuscle._common.text import rounded
 from jaxmuscle.spectra._bin_law import NORMAL, student
 
 RARE = 0.01  # probability of so little scatter
 FARTHEST = 300.0  # logarithm of a factor, so that no end overflows
 
 
-class Measure(eqx.Module):
+class Measure(Shown, eqx.Module):
     """A `value` with its standard error `stderr` (`None` if there is none), both in `unit` ("1" for
     pure numbers).
 
@@ -29,6 +31,33 @@ class Measure(eqx.Module):
     unit: str
     error_from: str
     interval: tuple[float, float] | None = None
+
+    @classmethod
+    def from_row(cls, row: Sequence[Any]) -> "Measure":
+        """Of value, standard error, low and high end, unit and `error_from`, with `None` for what
+        does not exist."""
+        value, error, low, high, unit, error_from = row
+        interval = None if low is None else (low, high)
+        return cls(math.nan if value is None else value, error, unit, error_from, interval)
+
+    def in_words(self) -> str:
+        """The value, rounded to its error where it has one."""
+        if self.stderr is None:
+            return "none" if math.isnan(self.value) else f"{self.value:.3g}"
+        return " ± ".join(rounded(self.value, self.stderr))
+
+    def interval_in_words(self) -> str:
+        """The 95 % interval, empty where there is none."""
+        if self.interval is None or self.stderr is None:
+            return ""
+        return " to ".join(rounded(end, self.stderr)[0] for end in self.interval)
+
+    def _card(self) -> Card:
+        unit = "" if self.unit == "1" or math.isnan(self.value) else f" {self.unit}"
+        interval = self.interval_in_words()
+        return Card(
+            f"{self.in_words()}{unit}" + f" (95 % interval {interval}{unit})" * bool(interval)
+        )
 
     def row(self) -> dict[str, Any]:
         """As columns of a table, NaN for what does not exist."""

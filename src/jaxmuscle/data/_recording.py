@@ -19,6 +19,7 @@ from jaxmuscle.spectra._measures import peaks, regularity
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
+from ._measured import AS_RECORDED, RECORDED, measure_signals, tremor_band
 from ._recording_choice import Reading, recording_of
 from ._recording_quality import RecordingSummary, checked, clipping, plateau, running_median
 from ._recording_table import frame_table
@@ -26,8 +27,6 @@ from ._target import Target
 from ._target_fields import Quantity
 from ._units import UNITS, known_unit
 
-AS_RECORDED: dict[str, Any] = {"filter_direction": "both", "sampling": "filtered"}
-RECORDED = SpectrumSettings(**AS_RECORDED)
 LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
 SEGMENTS = 2  # a steady part holds at least this many
 SHORTEST = (RECORDED.length + (SEGMENTS - 1) * RECORDED.step) / RECORDED.rate  # s, which these take
@@ -481,6 +480,7 @@ def pooled_target(
     rows = np.stack([np.asarray(recording.spectrum(settings).power) for recording in recordings])
     segments = [recording.segments(settings) for recording in recordings]
     signals = [recording.filtered(settings) for recording in recordings]
+    held = signals if settings == RECORDED else [r.filtered(RECORDED) for r in recordings]
     means = np.array([float(np.mean(x)) for x in signals])
     variations = [
         float(np.std(x)) / max(abs(m), 1e-300) for x, m in zip(signals, means, strict=True)
@@ -514,6 +514,7 @@ def pooled_target(
         unit=unit,
         trial_power=rows if len(rows) > 1 else None,
         settings=settings,
+        measured=measure_signals(held, unit, tremor_band(quantity))[1],
         notices=notices_of(recordings, signals, settings.rate, drifts, quantity),
     )
 

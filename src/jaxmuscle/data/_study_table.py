@@ -24,6 +24,7 @@ from ._text_tables import SIGNS, cells_of, lines_of, number_in
 from ._trials import Trials
 
 NEEDED = ("file", "person")
+LONGEST_HEAD = 4096  # letters of the first line that are looked at
 TABLES = "the table of a study (.csv, .tsv, .txt or .toml)"
 LABELS = (*NEEDED, "group", "condition", "trial")
 # of `load_recording`, of `Trials.target`
@@ -160,9 +161,13 @@ class StudyFile(ReadingTable, kw_only=True):
             missing="the steady parts are looked for",
         ),
     ] = None
-    rung: Annotated[int | str | None, says("Model of all people: 0 to 3, or auto", missing="2")] = (
-        None
-    )
+    rung: Annotated[
+        int | str | None,
+        says(
+            "Model of all people: 0 to 3, or auto",
+            missing="3 where everybody has five trials in every condition, else 2",
+        ),
+    ] = None
     noise: Annotated[
         str | None,
         says(
@@ -174,7 +179,7 @@ class StudyFile(ReadingTable, kw_only=True):
         list[str] | None,
         says(
             "Quantities that are compared",
-            missing="all derived quantities but `high_frequency_floor`",
+            missing="eight measured ones and the frequencies of the two resonances",
         ),
     ] = None
     alpha: Annotated[float | None, says("Level of the tests, between 0 and 1", missing="0.05")] = (
@@ -246,13 +251,33 @@ def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") ->
     return StudyTable(_checked(places, path.parent, str(path)), options, path.name)
 
 
+def is_study(path: str | os.PathLike[str]) -> bool:
+    """Whether the file at `path` is the table of a study, as `run_study` reads it: a .toml that
+    names one or has `[[recordings]]`, or a text table with the columns file and person.
+
+        jm.data.is_study("study.csv")
+
+    It is read for that.
+    """
+    path = expanded(path)
+    if path.suffix.lower() == ".toml":
+        stated = parsed(read_text(path, instead=TABLES), str(path), "TOML")
+        return "table" in stated or "recordings" in stated
+    if path.suffix.lower() not in (".csv", ".tsv", ".txt") or not path.is_file():
+        return False
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        head = file.readline(LONGEST_HEAD)
+    delimiter = next((sign for sign in SIGNS if sign in head), ",")
+    return set(NEEDED) <= {name.strip().casefold() for name in cells_of(head, delimiter)}
+
+
 def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cell]:
     """The trials of every person in every condition made one target, each in its own or the
     `defaults`' window, or steady.
 
     **Raises:** `ValueError` naming the line of a file that cannot be read or has no steady part, of
-    a spectrum that is not that of the others, and of an mvc that is not that of the same person in
-    the same condition.
+    a spectrum or a unit that is not that of the others, and of an mvc that is not that of the same
+    person in the same condition.
     """
     together: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
     stated: dict[Any, tuple[Row, Any]] = {}
@@ -283,6 +308,8 @@ def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cel
                 "give all trials of a person in a condition the same mvc, or none",
             )
             recording = load_recording(row.file, **reading)
+            remedy = "give all in one unit, with the column units or by converting the files"
+            _as_before(stated, "unit", row, recording.unit, remedy)
             together[whose].append(recording if window == "all" else recording.steady(window))
         except ValueError as error:
             raise ValueError(f"{row.place}: {error}") from None

@@ -20,6 +20,8 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 
 from . import _target_fields as check
 from ._frequency_response import FrequencyResponse
+from ._measure import Measure
+from ._measured import measure_spectrum
 from ._target_fields import Provenance, Quantity, numbers_of
 from ._target_files import KEYS, REQUIRED, fields_of, on_grid, read_target, settings_of
 
@@ -60,6 +62,10 @@ class Target(Shown, eqx.Module):
       person*).
     - `stiffness`: the dynamic stiffness measured beside it, by a perturbation. Then
       `proportional_power` may be `None`: the target has no spectrum.
+    - `measured`: what was measured of the recordings themselves, a `Measure` by name, as
+      `steadiness` lists them. Without it the attribute says what the bins tell (shares by band,
+      median frequency, tremor) and what is stated here (mean, variation). `measures` has its
+      rows.
     - `settings`: how the spectrum was estimated. The model's spectrum is made in the same way.
     - `notices`: what was done to the numbers, in sentences.
 
@@ -83,6 +89,7 @@ class Target(Shown, eqx.Module):
     dispersion: tuple[float, ...] | None = eqx.field(static=True)
     reason: str | None = eqx.field(static=True)
     stiffness: FrequencyResponse | None
+    measures: tuple[tuple[Any, ...], ...] | None = eqx.field(static=True)
     settings: SpectrumSettings = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
 
@@ -105,6 +112,9 @@ class Target(Shown, eqx.Module):
         dispersion: float | Sequence[float] | None = None,
         reason: str | None = None,
         stiffness: FrequencyResponse | Mapping[str, Any] | None = None,
+        measured: Mapping[str, Measure | Mapping[str, Any]]
+        | tuple[tuple[Any, ...], ...]
+        | None = None,
         settings: SpectrumSettings | None = None,
         notices: Iterable[str] = (),
     ):
@@ -123,6 +133,7 @@ class Target(Shown, eqx.Module):
         self.mvc_fraction = check.metadata("mvc_fraction", mvc_fraction)
         self.mean, self.unit = check.metadata("mean", mean), check.metadata("unit", unit)
         self.reason = check.metadata("reason", reason)
+        self.measures = check.metadata("measured", measured)
         self.settings = settings
         self.stiffness = (
             FrequencyResponse.from_table(stiffness) if isinstance(stiffness, Mapping) else stiffness
@@ -152,6 +163,13 @@ class Target(Shown, eqx.Module):
             )
         own = _own_notices(self, float(np.sum(power)))
         self.notices = tuple(dict.fromkeys((*check.metadata("notices", list(notices)), *own)))
+
+    @property
+    def measured(self) -> dict[str, Measure]:
+        """What is measured, by name and without any model: of the recordings, or of the bins."""
+        if self.measures is None:
+            return measure_spectrum(self)
+        return {name: Measure.from_row(row) for name, *row in self.measures}
 
     @property
     def degrees_of_freedom(self) -> float | None:
@@ -239,6 +257,7 @@ class Target(Shown, eqx.Module):
         arrays |= {"proportional_power": self.proportional_power.tolist(), "sigma": sigma}
         arrays["trial_power"] = None if self.trial_power is None else self.trial_power.tolist()
         arrays["dispersion"] = self.dispersion if self.trial_power is None else None
+        arrays["measured"] = None if self.measures is None else check.measured_table(self.measures)
         arrays["stiffness"] = None if self.stiffness is None else self.stiffness.to_table()
         table = {key: arrays[key] if key in arrays else getattr(self, key) for key in KEYS}
         return (
@@ -266,6 +285,12 @@ class Target(Shown, eqx.Module):
     def with_stiffness(self, stiffness: FrequencyResponse) -> "Target":
         """The same with a dynamic stiffness that was measured beside it."""
         return Target.from_table(self.to_table() | {"stiffness": stiffness})
+
+    def with_measures(self) -> "Target":
+        """The same, which keeps what is measured of its bins."""
+        if self.measures is not None:
+            return self
+        return Target.from_table(self.to_table() | {"measured": self.measured})
 
     def plot(self, ax: Any = None, *, log: bool = False) -> Any:
         """Draw the spectrum, see `jaxmuscle.plot.target`; `log`: both axes logarithmic. Returns the

@@ -2,7 +2,7 @@
 right."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -12,6 +12,8 @@ from jaxtyping import Float, Int
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.text import choices, listed
 from jaxmuscle.spectra._settings import FASTEST, SpectrumSettings
+
+from ._measure import Measure
 
 Quantity = Literal["force", "torque", "displacement", "acceleration"]
 Provenance = Literal["measured", "digitised", "reconstructed", "user"]
@@ -23,6 +25,7 @@ PIXEL_TOLERANCE = 0.1
 # or, as a fraction of the frequency, one pixel where a decade is 230 pixels wide.
 PIXEL_OF_LOG = 0.01
 MOST = 10**9  # segments of a trial
+MEASURED = ("value", "stderr", "low", "high", "unit", "error_from")
 
 
 class Columns(NamedTuple):
@@ -151,6 +154,44 @@ def _each(
     return check_each
 
 
+def _measures(name: str, value: Any) -> tuple[tuple[Any, ...], ...]:
+    """Measures by name as rows (name, value, standard error, ends of the interval, unit, error
+    from), None for what does not exist."""
+    if isinstance(value, tuple):  # as stored
+        return value
+    rows = []
+    for quantity, given in value.items() if isinstance(value, Mapping) else [(value, None)]:
+        row: Any = given.row() if isinstance(given, Measure) else given
+        fits = (
+            isinstance(row, Mapping)
+            and row.keys() <= {*MEASURED}
+            and {"unit", "error_from"} <= row.keys()
+        )
+        if not (isinstance(quantity, str) and fits):
+            raise TargetError(
+                f"{name}: {quantity!r} needs a table with the keys {', '.join(MEASURED)}; the"
+                " numbers may be missing"
+            )
+        numbers = [row.get(key) for key in MEASURED[:4]]
+        for key, number in zip(MEASURED, numbers, strict=False):
+            if number is not None and not is_number(number):
+                raise TargetError(f"{name}.{quantity}: {key} {number!r} is not a number")
+        known = [None if n is None or not math.isfinite(n) else float(n) for n in numbers]
+        if (known[2] is None) != (known[3] is None):
+            raise TargetError(f"{name}.{quantity}: give both low and high, or neither")
+        words = (_text(f"{name}.{quantity}: {key}", row[key]) for key in MEASURED[4:])
+        rows.append((quantity, *known, *words))
+    return tuple(rows)
+
+
+def measured_table(rows: tuple[tuple[Any, ...], ...]) -> dict[str, dict[str, Any]]:
+    """The reverse: what a file holds, without what does not exist."""
+    return {
+        name: {key: value for key, value in zip(MEASURED, row, strict=True) if value is not None}
+        for name, *row in rows
+    }
+
+
 CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "name": _text,
     "quantity": _one_of(Quantity),
@@ -163,6 +204,7 @@ CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "unit": _text,
     "dispersion": _each(_positive),
     "reason": _text,
+    "measured": _measures,
     "notices": _each(_text, empty=True),
 }
 OPTIONAL = (
@@ -173,6 +215,7 @@ OPTIONAL = (
     "unit",
     "dispersion",
     "reason",
+    "measured",
 )
 
 

@@ -46,7 +46,7 @@ METADATA = (
     "reason",
     "notices",
 )
-KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "stiffness", "settings")
+KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "stiffness", "measured", "settings")
 QUANTITIES, PROVENANCES = ("one of " + ", ".join(get_args(kind)) for kind in (Quantity, Provenance))
 POSITIVES = "numbers, each above 0"
 
@@ -296,6 +296,16 @@ class TargetFile(Table, kw_only=True):
         Any,
         says(
             "Dynamic stiffness measured beside it", missing="not measured", kind="table, see below"
+        ),
+    ] = None
+    measured: Annotated[
+        Any,
+        says(
+            "What `jaxmuscle steadiness` measures of the recordings: for each quantity a table with"
+            " `value`, `stderr`, `low` and `high` (ends of the 95 % interval), `unit`,"
+            " `error_from`",
+            missing="measured of the bins",
+            kind="table of tables",
         ),
     ] = None
     settings: Annotated[

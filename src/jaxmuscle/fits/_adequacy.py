@@ -25,7 +25,6 @@ from jaxmuscle.response._expected import Moments
 from ._checks import Stage, seen_best
 from ._half_power import HALF_POWER, half_power_intervals
 from ._intervals import Interval, intervals
-from ._part import met
 from ._refit import STRENGTHS, Refit, refit_of
 
 ADEQUATE = 0.01
@@ -121,27 +120,14 @@ class Endpoint:
             for part, moments in zip(self.objective.parts, self.seen.moments, strict=True)
         )
 
-    @functools.cached_property
-    def met(self) -> frozenset[str]:
-        """The means and coefficients of variation that were measured and that the fit meets.
-
-        Their errors are those of the measurement: that the spectrum misses its data does not make
-        them less certain.
-        """
-        several = len(self.problem.parts) > 1
-        return frozenset(
-            f"{name}@{part.name}" if several else name
-            for part, own in zip(self.problem.parts, self.further, strict=True)
-            for name in met(own)
-        )
-
-    def widening(self, name: str) -> float:
-        """By how much the errors of a quantity grow."""
-        return 1.0 if self.adequacy is None or name in self.met else self.adequacy.widening
+    @property
+    def widening(self) -> float:
+        """By how much the errors grow."""
+        return 1.0 if self.adequacy is None else self.adequacy.widening
 
     def intervals(self, names: list[str]) -> dict[str, Interval]:
         """95 % intervals of these quantities; computed once."""
-        new = {name: self.widening(name) for name in names if name not in self._ends}
+        new = {name: self.widening for name in names if name not in self._ends}
         bent = {name: new.pop(name) for name in list(new) if base_of(name) == HALF_POWER}
         where = self.problem, self.objective, self.seen, self.covariance
         self._ends.update(intervals(*where, new) | half_power_intervals(*where, bent))

@@ -22,9 +22,10 @@ from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import BinStatistics, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._part import Estimate, FittedPart, Start, met
+from ._part import Estimate, FittedPart, Start
 
 AMBIGUOUS, OTHER = 2.0, 3.0
+MISSED = 3.0  # standard deviations of a measured mean or variation
 PULLED = 3.0  # prior standard deviations
 # standard errors of a response that is seen clearly; of the tangent stiffness
 CLEAR, EXTRAPOLATED = 4.0, 2.0
@@ -272,7 +273,7 @@ def further_notices(further: Mapping[str, float]) -> tuple[str, ...]:
         f" {'above' if off > 0 else 'below'} the given one. The model cannot meet this value and"
         " the other data together: check how the value was measured"
         for name, off in further.items()
-        if name not in met(further)
+        if abs(off) > MISSED
     )
 
 

@@ -1,6 +1,8 @@
 """Many targets fitted together, and what differs between groups of them."""
 
+import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +15,7 @@ from jaxmuscle._common.environment import fitting, versions
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.types import Key
+from jaxmuscle.data._measure import Measure
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
@@ -20,6 +23,7 @@ from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
 from jaxmuscle.objective._arguments import FitOptions, Plan, at_mean, planned, task_for
 from jaxmuscle.spectra._bin_law import trial_samples
+from jaxmuscle.spectra._fluctuations import BANDS
 
 from ._differences import Difference, difference
 from ._ladder import options_for
@@ -39,6 +43,7 @@ COLUMNS = (
     "target",
     "group",
     "quantity",
+    "kind",
     "value",
     "stderr",
     "low",
@@ -84,15 +89,18 @@ class CohortResult(Result, eqx.Module):
         bad = [name for name, adequate in judged.items() if not adequate]
         said = f"the model describes {len(judged) - len(bad)} of {len(judged)} targets"
         return said + (
-            f"; it does not describe {', '.join(bad)}, whose errors are widened" if bad else ""
+            f"; it does not describe {'; '.join(bad)}, so the model's numbers of these are left"
+            " out of comparisons"
+            if bad
+            else ""
         )
 
     def _card(self) -> Card:
         return reports().cohort_card(self)
 
     def table(self) -> list[dict[str, Any]]:
-        """Tidy rows, one per target and quantity (free parameters, then derived ones), with the
-        columns that *Results as numbers* lists (docs/reference/index.md).
+        """Tidy rows, one per target and quantity (measured ones, free parameters, derived ones),
+        with the columns that *Results as numbers* lists (docs/reference/index.md).
 
         `low` and `high` are the ends of the 95 % interval.
         """
@@ -104,11 +112,12 @@ class CohortResult(Result, eqx.Module):
                         name,
                         self.groups.get(name, ""),
                         quantity,
+                        "measured" if isinstance(e, Measure) else "model",
                         e.value,
                         e.stderr,
                         *_ends(e),
                         e.unit,
-                        e.identifiable,
+                        e.stderr is not None,
                         result.target.mvc_fraction,
                         result.chi2_per_bin,
                         result.adequate,
@@ -153,7 +162,7 @@ class CohortResult(Result, eqx.Module):
                 "stderr": (dims, grid(lambda e: _or_nan(e.stderr), np.nan)),
                 "low": (dims, grid(lambda e: _or_nan(_ends(e)[0]), np.nan)),
                 "high": (dims, grid(lambda e: _or_nan(_ends(e)[1]), np.nan)),
-                "determined": (dims, grid(lambda e: e.identifiable, False)),
+                "determined": (dims, grid(lambda e: e.stderr is not None, False)),
                 "chi2_per_bin": ("target", [_or_nan(result.chi2_per_bin) for result in results]),
                 "adequacy_p": ("target", [_or_nan(result.adequacy_p) for result in results]),
                 "success": ("target", [result.success for result in results]),
@@ -172,27 +181,30 @@ class CohortResult(Result, eqx.Module):
         )
 
     def differences(self) -> tuple[Difference, ...]:
-        """Every determined quantity, every two groups: difference of the means and its interval.
+        """Every quantity that is measured or determined, every two groups: difference of the means
+        and its interval.
 
-        Members whose data do not determine the quantity are left out.
+        Members whose data do not determine the quantity, and of the model's those that it does not
+        describe, are `left_out`.
         """
+        known = {name: comparable(result) for name, result in self.results.items()}
+        members: dict[str, list[str]] = {}
+        for name in known:
+            members.setdefault(self.groups.get(name, ""), []).append(name)
         found = []
-        groups = list(dict.fromkeys(self.groups.get(name, "") for name in self.results))
-        for quantity in dict.fromkeys(
-            q for result in self.results.values() for q in _determined(result)
-        ):
-            for a, b in itertools.combinations(groups, 2):
-                left, right = self._members(quantity, a), self._members(quantity, b)
-                if left and right:
-                    found.append(difference(quantity, (a, left), (b, right)))
+        for quantity in dict.fromkeys(q for table in known.values() for q in table):
+            for a, b in itertools.combinations(members, 2):
+                left, right = (
+                    [known[name][quantity] for name in members[group] if quantity in known[name]]
+                    for group in (a, b)
+                )
+                sure = all(e.stderr is not None for e in (*left, *right))
+                # of a single member its own error is all there is
+                if left and right and (sure or min(len(left), len(right)) > 1):
+                    out = len(members[a]) + len(members[b]) - len(left) - len(right)
+                    made = difference(quantity, (a, left), (b, right))
+                    found.append(dataclasses.replace(made, left_out=out))
         return tuple(found)
-
-    def _members(self, quantity: str, group: str) -> list[Any]:
-        return [
-            _determined(result)[quantity]
-            for name, result in self.results.items()
-            if self.groups.get(name, "") == group and quantity in _determined(result)
-        ]
 
     def plot(self, by: str = "person", ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Determined quantities with their standard errors, by "person", "group" or "level"
@@ -204,19 +216,30 @@ def _or_nan(value: float | None) -> float:
     return np.nan if value is None else float(value)
 
 
-def _ends(estimate: Estimate) -> tuple[float | None, float | None]:
+def _ends(estimate: Estimate | Measure) -> tuple[float | None, float | None]:
     """Of the 95 % interval."""
     return (None, None) if estimate.interval is None else estimate.interval
 
 
 def _quantities(result: FitResult) -> dict[str, Any]:
-    """Free parameters and derived quantities, as they are shown; what is both (the tremor's
-    frequency) once."""
-    return result.as_shown(result.found)
+    """What is measured; free parameters and derived quantities, as they are shown, what is both
+    once."""
+    return result.measured | result.as_shown(result.found)
 
 
-def _determined(result: FitResult) -> dict[str, Any]:
-    return result.as_shown(result.determined)
+def comparable(result: FitResult) -> dict[str, Any]:
+    """What may be compared with another fit: what is measured and exists (but the p-value of the
+    tremor); and what the data determine, if the model describes them."""
+    known = {
+        name: m
+        for name, m in result.measured.items()
+        if math.isfinite(m.value) and name != "tremor_p"
+    }
+    if result.adequate is False:
+        return known
+    # the bands of the fit repeat the measured shares
+    of_model = {n: e for n, e in result.as_shown(result.determined).items() if n not in BANDS}
+    return known | of_model
 
 
 def fit_cohort(  # noqa: PLR0913 (options of a public call)
@@ -257,7 +280,7 @@ def fit_cohort(  # noqa: PLR0913 (options of a public call)
       `coefficient_of_variation`: as in `fit`
     - `starts` for each target
     - `rung`: the model of all of them (`on_rung`: 0 the base model, 1 with activation, 2 with
-      tremor, 3 with a second resonance), so that their numbers can be compared
+      resonance, 3 with a second one), so that their numbers can be compared
     - `progress`: True or a function of (text, share)
 
     **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these

@@ -9,9 +9,11 @@ import numpy as np
 import scipy
 
 from jaxmuscle._common.text import choices
+from jaxmuscle.data._measure import Measure
 
 from ._part import Estimate
 
+Number = Estimate | Measure
 CONFIDENCE = 0.95
 CORRECTIONS = ("holm", "fdr", "none")
 
@@ -30,8 +32,9 @@ class Difference(eqx.Module):
     In a study also: `kind`, "groups" (at `where`, a condition), "conditions" (`b` minus `a` within
     people) or "interaction" (the change between two conditions in group `b` minus that in group
     `a`; with `where` "tired - rest" the change is the value in tired minus that in rest);
-    `p_corrected` for all comparisons of that kind; `left_out`, people whose fits do not determine
-    the quantity.
+    `p_corrected` for all comparisons of that kind, measured ones and the model's apart; `left_out`,
+    people of whom the quantity is not known: they show no tremor, or the data do not determine it,
+    or the model does not describe them.
     """
 
     quantity: str
@@ -52,8 +55,8 @@ class Difference(eqx.Module):
 
 def difference(
     quantity: str,
-    a: tuple[str, Sequence[Estimate]],
-    b: tuple[str, Sequence[Estimate]],
+    a: tuple[str, Sequence[Number]],
+    b: tuple[str, Sequence[Number]],
     confidence: float = CONFIDENCE,
 ) -> Difference:
     """Of the means of two groups of people, by Welch's t; by the fits' standard errors where one
@@ -87,7 +90,7 @@ def difference(
 
 
 def paired(
-    quantity: str, a: str, b: str, changes: Sequence[Estimate], confidence: float = CONFIDENCE
+    quantity: str, a: str, b: str, changes: Sequence[Number], confidence: float = CONFIDENCE
 ) -> Difference:
     """Of two conditions, from every person's change from `a` to `b`, by the paired t."""
     values = [change.value for change in changes]
@@ -109,7 +112,7 @@ def paired(
     )
 
 
-def change(a: Estimate, b: Estimate) -> Estimate:
+def change(a: Number, b: Number) -> Estimate:
     """What one person's quantity does from one condition to the other, the fits' errors taken as
     independent."""
     return Estimate(b.value - a.value, a.unit, float(np.hypot(a.stderr or 0.0, b.stderr or 0.0)))

@@ -10,9 +10,7 @@ from jaxmuscle._common.keys import SEEDS
 from jaxmuscle.data._target import Target
 from jaxmuscle.objective._arguments import METHODS, RESIDUALS
 
-FORMAT = 4
-# that can be read; 2 may leave out what task and target do not have, 3 where starts ended
-FORMATS = (2, 3, 4)
+FORMAT = 5
 
 Number = float | None  # null where it is not finite
 Numbers = list[Number]
@@ -59,7 +57,7 @@ class RungTable(Table, kw_only=True):
 
     number: Annotated[
         Annotated[int, Meta(ge=-1)],
-        says("-1 noise alone, 0 base, 1 activation, 2 tremor, 3 resonance"),
+        says("-1 noise alone, 0 base, 1 activation, 2 resonance, 3 two resonances"),
     ]
     model: Annotated[str, says("The model in words")]
     aic: Annotated[float, says("-2 ln L + 2 parameters")]
@@ -86,10 +84,10 @@ class StartTable(Table, kw_only=True):
     values: Annotated[
         tuple[float, ...],
         says(
-            "Free parameters where it ended, in their units, in the order of settings.free",
-            missing="unknown (formats 2 and 3)",
+            "Free parameters where it ended, in their units, in the order of settings.free; empty"
+            " where that is not finite"
         ),
-    ] = ()
+    ]
 
 
 class CorrelationTable(Table, kw_only=True):
@@ -196,7 +194,7 @@ class SpectrumTable(Table, kw_only=True):
     ]
     components: Annotated[
         dict[str, Numbers],
-        says("Share of each bin: relaxation, floor, harmonic, and tremor, resonance_2 if any"),
+        says("Share of each bin: relaxation, floor, harmonic, and resonance, resonance_2 if any"),
     ]
 
 
@@ -255,7 +253,7 @@ class PartTable(Table, kw_only=True):
 class FitTable(Table, kw_only=True):
     """The keys of a fit."""
 
-    format: Annotated[Literal[FORMATS], says("Version of the format")]  # pyright: ignore[reportInvalidTypeForm]
+    format: Annotated[Literal[5], says("Version of the format")]
     success: Annotated[bool, says("Whether the search converged")]
     message: Annotated[str, says("How the search ended")]
     adequate: Annotated[
@@ -269,13 +267,6 @@ class FitTable(Table, kw_only=True):
         dict[str, EstimateTable], says("Every parameter; of several targets also name@target")
     ]
     derived: Annotated[dict[str, EstimateTable], says("Quantities that follow from the parameters")]
-    products: Annotated[
-        list[str],
-        says(
-            "What of the parameters the data determine: single ones, products (`k_w noise_K_w`),"
-            " ratios (`k_w / c_w`)"
-        ),
-    ]
     per_newton: Annotated[
         dict[str, Number], says("Stiffness [1/m] and damping [s/m] over the mean force")
     ]

@@ -28,6 +28,7 @@ from jaxmuscle.objective._arguments import (
     target_of,
     task_for,
 )
+from jaxmuscle.objective._derived import MEAN
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._scaling import at_force, is_scalable, times_force
 
@@ -181,7 +182,7 @@ def _far_from_means(result: FitResult) -> tuple[str, ...]:
     for name, part in result.parts.items():
         stated, own = (
             part.target.mean_force,
-            result.derived.get(f"mean@{name}" if len(result.parts) > 1 else "mean"),
+            result.derived.get(f"{MEAN}@{name}" if len(result.parts) > 1 else MEAN),
         )
         if stated is not None and own is not None and abs(own.value - stated[0]) > FAR * stated[0]:
             found.append(

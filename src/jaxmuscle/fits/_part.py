@@ -1,7 +1,6 @@
 """What a fit found of one target, and numbers with their errors: as objects and as tables."""
 
 import math
-import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -17,14 +16,13 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._covariance import spelt
+from jaxmuscle.objective._derived import MEAN
 
 from ._fit_file import EstimateTable, PartTable, check_lengths
 
 if TYPE_CHECKING:
     import pandas
 
-MISSED = 3.0  # standard deviations
 RELATIVE = {
     "N": "1",
     "N/m": "1/m",
@@ -33,18 +31,8 @@ RELATIVE = {
     "N s^3/m^3": "s^3/m^3",
     "kg": "kg/N",
 }
-ALIASES = {
-    "resonance_frequency": "tremor_frequency",
-    "resonance_width": "tremor_width",
-    "activation_time": "contraction_time",
-}
+ALIASES = {"activation_time": "contraction_time"}
 SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
-
-
-def met(further: Mapping[str, float]) -> tuple[str, ...]:
-    """Which of the measured mean and coefficient of variation a fit meets within three standard
-    deviations."""
-    return tuple(name for name, off in further.items() if abs(off) <= MISSED)
 
 
 class Estimate(Shown, eqx.Module):
@@ -123,7 +111,7 @@ class Start(eqx.Module):
 
     `success`: whether its last step lowered the cost by less than a thousandth of it. `values`,
     where the free parameters ended, in the order of `settings["free"]`; empty where that is not
-    finite, and of fits that were saved before version 4 of their format.
+    finite.
     """
 
     cost: float | None
@@ -142,9 +130,9 @@ class FittedPart(eqx.Module):
     `deviation`, the standard deviation of each log power (None where it is unknown); `components`,
     what share of each bin's power the parts of the model have in linear response: the `relaxation`
     of the active tissue under its noise, the `floor` from noise on the passive one, the `harmonic`,
-    the `tremor`, `resonance_2`; `stretch`, time and output of a few simulated seconds; `check`, how
-    far linear response and nonlinear simulation differ; `further`, residuals of the coefficient of
-    variation and of the mean, as far as they are data [standard deviations], positive where the
+    the `resonance`, `resonance_2`; `stretch`, time and output of a few simulated seconds; `check`,
+    how far linear response and nonlinear simulation differ; `further`, residuals of the coefficient
+    of variation and of the mean, as far as they are data [standard deviations], positive where the
     model is above the data; `stiffness`, the fitted dynamic stiffness [N/m] at the frequencies of
     the target's.
     """
@@ -251,11 +239,6 @@ class FittedPart(eqx.Module):
         )
 
 
-def as_people_say(product: str) -> str:
-    """A product of parameters by the names of the table above it."""
-    return re.sub(r"\w+", lambda word: in_use(word[0]) or word[0], spelt(product))
-
-
 def in_use(name: str) -> str | None:
     """The name that people use for a parameter, of one target or "name@target"; None where that is
     its own."""
@@ -278,7 +261,7 @@ def per_newton(table: Mapping[str, Estimate], mean: float) -> dict[str, Estimate
     return {
         n: _over(p, mean) if p.unit in RELATIVE else p
         for n, p in table.items()
-        if base_of(n) != "mean"
+        if base_of(n) != MEAN
     }
 
 
@@ -353,15 +336,14 @@ def part_to_table(part: FittedPart) -> dict[str, Any]:
     }
 
 
-def read_part(table: PartTable, *, whole: bool) -> FittedPart:
-    """The reverse of `part_to_table`; without `whole` task and target may leave out what they do
-    not have."""
+def read_part(table: PartTable) -> FittedPart:
+    """The reverse of `part_to_table`."""
     spectrum, stretch, stiffness = table.spectrum, table.stretch, table.stiffness
-    target = Target.from_table(table.target_table, whole=whole)
+    target = Target.from_table(table.target_table, whole=True)
     check_lengths(table, target)
     return FittedPart(
         target=target,
-        task=task_from_table(table.task_table, whole=whole),
+        task=task_from_table(table.task_table, whole=True),
         chi2_per_bin=table.chi2_per_bin,
         rms_log_error=table.rms_log_error,
         **{field: from_nulls(getattr(spectrum, field)) for field in SPECTRUM},

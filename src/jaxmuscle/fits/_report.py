@@ -14,7 +14,7 @@ from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.model._noises import with_active_noise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan, base_of
-from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products
+from jaxmuscle.objective._covariance import Identifiability, common_scales
 from jaxmuscle.objective._derived import jackknife, observed
 from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem, Part
@@ -164,7 +164,6 @@ def report_fit(
     parameters = parameter_table(problem, tasks, covariance, known)
     derived = merged(problem, tables, found.slopes)
     c = problem.coordinates
-    products = tuple(known_products(c.names, c.positive, c.sd, known))
     other, moved = rivals(
         problem, stages[0] if problem.method == "linear" else stages[-1], parameters | derived
     )
@@ -204,7 +203,6 @@ def report_fit(
         parameters=parameters,
         derived=derived,
         correlation=correlation_table(problem.coordinates.names, covariance),
-        products=products,
         undetermined=common_scales(problem.coordinates.names, known),
         singular_values=known.singular_values,
         profile=None if line_test is None else (line_test.frequency, line_test.rise),
@@ -313,7 +311,7 @@ def _parts(
         ]
         notices += own if len(tasks) == 1 else [f"{part.name}: {notice}" for notice in own]
         parts[part.name or target.name] = FittedPart(
-            target=target,
+            target=target.with_measures(),
             task=task,
             chi2_per_bin=(
                 float(np.sum(residual**2) / (len(residual) - 1))
@@ -356,7 +354,7 @@ def _components(part: Part, task: AbstractTask) -> dict[str, np.ndarray]:
         "relaxation",
         "floor",
         "harmonic",
-        "tremor",
+        "resonance",
         *(f"resonance_{i}" for i in range(2, len(rhythms))),
     )
     return {
@@ -454,7 +452,6 @@ def _failed(problem: FitProblem, common: dict[str, Any], reason: str) -> FitResu
         adequacy=None,
         parts=parts,
         derived={},
-        products=(),
         correlation={},
         undetermined=(),
         parameters=parameter_table(problem, tasks, np.zeros((free, free)), unknown),

@@ -21,13 +21,14 @@ from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, probability
+from jaxmuscle.data._measure import Measure
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import base_of, target_of
-from jaxmuscle.objective._derived import derived_names
+from jaxmuscle.objective._derived import MEAN, derived_names
 
 from ._adequacy import Adequacy
-from ._fit_file import FORMAT, FORMATS, FitTable, PartTable
+from ._fit_file import FORMAT, FitTable, PartTable
 from ._ladder import Rung
 from ._part import (
     Estimate,
@@ -35,7 +36,6 @@ from ._part import (
     Start,
     estimates_to_table,
     in_use,
-    met,
     once,
     part_to_table,
     per_newton,
@@ -50,11 +50,11 @@ if TYPE_CHECKING:
 
 
 WHAT_TO_DO = (
-    "what to do: do not interpret the parameters. Report that the model does not describe the data,"
-    " and report none of its numbers. What needs no model (mean, variation, power by band, the peak"
-    " of a tremor) comes from `jaxmuscle steadiness`. To go on, look at the residuals in the"
-    " figure, and whether the recording drifts. `jaxmuscle compare fit.json` tries other noises; it"
-    " takes as long as all fits so far"
+    "so no number of the model is shown: report what is measured, and that the model does not"
+    " describe the data. (fit.json and report.html have its numbers; their standard errors are"
+    " widened by a factor of {:.2g}.) To go on, look at the residuals in the figure, and whether"
+    " the recording drifts. `jaxmuscle compare fit.json` tries other noises; it takes as long as"
+    " all fits so far"
 )
 SAME = 1e-9  # relative, of a number that stands twice in a file
 PROFILE = ("frequency_hz", "chi2_rise")
@@ -65,12 +65,11 @@ class FitResult(Result, eqx.Module):
 
     `success` and `message`, whether the search converged; `adequacy`, whether the model describes
     the data (an `Adequacy`, None where the scatter of the data is unknown or there is no fit);
-    `parts`, a `FittedPart` for each target by name; `method`; `parameters` and `derived`
-    (`Estimate`s; with several targets, what belongs to one is called "name@target", what is the
-    same number for all by its own name), their errors multiplied by `adequacy.widening`, √(chi² /
-    expected), where the model does not describe the data (but not that of a measured mean or
-    coefficient of variation which the fit meets); `products` and ratios of parameters that the data
-    determine; `correlation` of the free parameters; `undetermined`, sentences naming what can be
+    `parts`, a `FittedPart` for each target by name; `method`; `measured`, what needs no model;
+    `parameters` and `derived` (`Estimate`s; with several targets, what belongs to one is called
+    "name@target", what is the same number for all by its own name), their errors multiplied by
+    `adequacy.widening`, √(chi² / expected), where the model does not describe the data;
+    `correlation` of the free parameters; `undetermined`, sentences naming what can be
     scaled together without the data noticing; `ladder`, the models that were tried (`Rung`s; empty
     where one was asked for, in a cohort the one that all got); `singular_values` of the Jacobian
     (residuals in standard deviations, parameters in the prior's); the table of `starts`; `profile`,
@@ -89,7 +88,6 @@ class FitResult(Result, eqx.Module):
     method: str
     parameters: dict[str, Estimate]
     derived: dict[str, Estimate]
-    products: tuple[str, ...]
     correlation: dict[str, Any]
     undetermined: tuple[str, ...]
     ladder: tuple[Rung, ...]
@@ -102,18 +100,28 @@ class FitResult(Result, eqx.Module):
     settings: dict[str, Any]
     versions: dict[str, str]
 
-    def __getitem__(self, name: str) -> Estimate:
-        """The parameter or derived quantity of that name, with its `value`, `stderr`, `interval`
-        and `unit`.
+    @property
+    def measured(self) -> dict[str, Measure]:
+        """What is measured of the recordings or the spectrum, without the model, by name: with
+        several targets "name@target"."""
+        return {
+            name + (f"@{target}" if len(self.parts) > 1 else ""): m
+            for target, part in self.parts.items()
+            for name, m in part.target.measured.items()
+        }
+
+    def __getitem__(self, name: str) -> Estimate | Measure:
+        """The measured quantity, parameter or derived quantity of that name, with its `value`,
+        `stderr`, `interval` and `unit`.
 
         Where no mean force in newtons was given, these are newtons of the model muscle, and print
         shows forces, masses, stiffness and damping divided by its mean force,
-        `result["mean"].value`, as the person's are unknown. `per_newton` and
+        `result["model_mean"].value`, as the person's are unknown. `per_newton` and
         `as_shown(result.found)` give what is shown.
 
         Raises `ValueError` for an unknown name.
         """
-        known = self.parameters | self.derived
+        known = self.measured | self.parameters | self.derived
         if name not in known:
             raise ValueError(
                 f"unknown quantity {name!r} of the fit of {self.title}: {choices(name, known)}"
@@ -121,23 +129,33 @@ class FitResult(Result, eqx.Module):
         return known[name]
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row for each parameter and derived quantity, in the units of `result[name]`.
+        """A row for each measured quantity, parameter and derived quantity, in the units of
+        `result[name]`.
 
         What is both has one row. It counts as a parameter, and has the name that people use, as
-        `tremor_frequency`.
+        `contraction_time`.
 
-        Columns: `quantity`; `kind`, "parameter" or "derived"; `value`; `stderr`, NaN where the data
-        do not determine it; `low` and `high`, ends of the 95 % interval, NaN where one is open or
-        was not computed; `unit`; `free`, whether it was fitted; `determined`, whether it has a
-        standard error.
+        Columns: `quantity`; `kind`, "measured", "parameter" or "derived"; `value`; `stderr`, NaN
+        where the data do not determine it; `low` and `high`, ends of the 95 % interval, NaN where
+        one is open or was not computed; `unit`; `error_from`, what a measured one's error stands
+        on; `free`, whether it was fitted; `determined`, whether it has a standard error.
         """
         own = self.parameters.keys() | {in_use(name) for name in self.parameters}
-        return frame(
-            [
-                {"quantity": name, "kind": "parameter" if name in own else "derived", **p.row()}
-                for name, p in once(self.parameters, self.derived).items()
-            ]
-        )
+        rows = [
+            {
+                "quantity": name,
+                "kind": "measured",
+                **m.row(),
+                "free": False,
+                "determined": m.stderr is not None,
+            }
+            for name, m in self.measured.items()
+        ]
+        rows += [
+            {"quantity": name, "kind": "parameter" if name in own else "derived", **p.row()}
+            for name, p in once(self.parameters, self.derived).items()
+        ]
+        return frame(rows)
 
     @property
     def only(self) -> FittedPart:
@@ -208,21 +226,7 @@ class FitResult(Result, eqx.Module):
         """What the verdict means for the numbers, and what to do."""
         if self.adequacy is None or self.adequacy.adequate:
             return ()
-        told = [
-            f"standard errors are widened by a factor of {self.adequacy.widening:.2g}: the model"
-            " misses the data"
-        ]
-        measured = {
-            name.replace("_", " ") for part in self.parts.values() for name in met(part.further)
-        }
-        if measured:
-            told[0] += f". Not widened, since measured directly: {', '.join(sorted(measured))}"
-        if "harmonic_frequency" in self.free:
-            told.append(
-                "no p-value of the harmonic: where the model misses the data, any harmonic improves"
-                " the fit"
-            )
-        return (*told, WHAT_TO_DO)
+        return (WHAT_TO_DO.format(self.adequacy.widening),)
 
     @property
     def per_newton(self) -> dict[str, float]:
@@ -234,7 +238,7 @@ class FitResult(Result, eqx.Module):
         known = len(self.parts) > 1 or self.settings.get("mean_force") is not None
         if known or self.only.stiffness is not None or self.task.output_unit != "N":
             return {}
-        mean = self.derived["mean"].value if "mean" in self.derived else np.nan
+        mean = self.derived[MEAN].value if MEAN in self.derived else np.nan
         return {
             n: self.derived[n].value / mean
             for n in ("K_w0", "K_z0", "C_w0", "C_z0")
@@ -299,6 +303,11 @@ class FitResult(Result, eqx.Module):
             )
         return tuple(said)
 
+    def details(self) -> str:
+        """As text all that it found: also models that were tried, parameters, what the data do not
+        determine."""
+        return reports().fit_text(self, everything=True)
+
     def methods(self) -> str | None:
         """A paragraph for the methods section of a paper; None for several targets, a moved
         insertion, a failed fit."""
@@ -316,7 +325,7 @@ class FitResult(Result, eqx.Module):
     def as_shown(self, table: Mapping[str, Estimate]) -> dict[str, Estimate]:
         """A table of quantities as it is shown: per newton of mean force where the scale of force
         is unknown."""
-        return per_newton(table, self.derived["mean"].value) if self.per_newton else dict(table)
+        return per_newton(table, self.derived[MEAN].value) if self.per_newton else dict(table)
 
     def _card(self) -> Card:
         return reports().fit_card(self)
@@ -339,7 +348,6 @@ def to_table(result: FitResult) -> dict[str, Any]:
         "method": result.method,
         "parameters": estimates_to_table(result.parameters),
         "derived": estimates_to_table(result.derived),
-        "products": list(result.products),
         "per_newton": {name: with_nulls(value) for name, value in result.per_newton.items()},
         "correlation": result.correlation,
         "undetermined": list(result.undetermined),
@@ -373,19 +381,16 @@ def load_result(path: str | Path) -> FitResult:
     table = parsed(
         read_text(path, ResultError, instead="a fit.json"), str(path), "JSON", ResultError
     )
-    if type(table.get("format")) is not int or table["format"] not in FORMATS:
+    if type(table.get("format")) is not int or table["format"] != FORMAT:
         raise ResultError(
-            f"{path}: is not a fit result of format {' or '.join(map(str, FORMATS))}; write it with"
-            " FitResult.save"
+            f"{path}: is not a fit result of format {FORMAT}: fit again, FitResult.save writes it"
         )
     try:
         result = _from_table(table, str(path))
         # What can be made from the rest of the file must be what the file says; words may have
         # changed since.
-        stated = {**table, "format": FORMAT, "verdict": result.verdict}
-        wrong = _disagreement(result) or contradiction(
-            stated, to_table(result), whole=table["format"] == FORMAT
-        )
+        stated = {**table, "verdict": result.verdict}
+        wrong = _disagreement(result) or contradiction(stated, to_table(result), whole=True)
     except (ValueError, ArithmeticError) as error:
         raise error if isinstance(error, ResultError) else ResultError(f"{path}: {error}") from None
     if wrong:
@@ -405,11 +410,9 @@ def _from_table(table: dict[str, Any], file: str) -> FitResult:
         key: value for key, value in table.items() if key != "parts" and (several or key not in own)
     }
     said = checked(rest, FitTable, file, ResultError)
-    whole = said.format > 2
     read = {
         name: read_part(
-            checked(part, PartTable, f"{file}: parts.{name}" if several else file, ResultError),
-            whole=whole,
+            checked(part, PartTable, f"{file}: parts.{name}" if several else file, ResultError)
         )
         for name, part in parts.items()
     }
@@ -424,7 +427,6 @@ def _from_table(table: dict[str, Any], file: str) -> FitResult:
         method=said.method,
         parameters=read_estimates(said.parameters),
         derived=read_estimates(said.derived),
-        products=tuple(said.products),
         correlation=table["correlation"],
         undetermined=tuple(said.undetermined),
         ladder=tuple(Rung(**msgspec.structs.asdict(rung)) for rung in said.ladder),

@@ -1,15 +1,16 @@
-"""A study: trials of people in conditions and groups, one model fitted to all, what differs, one
-folder of results."""
+"""A study: trials of people in conditions and groups; what is measured of them, one model fitted to
+all, what differs, one folder of results."""
 
 import contextlib
 import dataclasses
 import itertools
+import math
 import os
 import tempfile
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -25,14 +26,15 @@ from jaxmuscle._common.progress import Tell, told
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH, choices
 from jaxmuscle._common.types import Key
+from jaxmuscle.data._measured import MEASURES
 from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_study
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._derived import DERIVED
 
 from ._cohort import CohortResult, fit_cohort
-from ._differences import CORRECTIONS, Difference, change, corrected, difference, paired
-from ._part import ALIASES, Estimate, estimates_to_table
+from ._differences import CORRECTIONS, Difference, Number, change, corrected, difference, paired
+from ._part import ALIASES, estimates_to_table
 
 if TYPE_CHECKING:
     import pandas
@@ -40,19 +42,35 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 AUTO = "auto"
-USUAL = {"rung": 2, "noise": None, "quantities": None, "alpha": 0.05, "correction": "holm"}
-FORMAT = 1
-# which is the band from 8 to 12 Hz again
-COMPARED = tuple(name for name in DERIVED if name != "high_frequency_floor")
+USUAL = {"rung": None, "noise": None, "quantities": None, "alpha": 0.05, "correction": "holm"}
+FORMAT = 2
+# What is compared: measured quantities, and the frequencies of the model's two resonances.
+MEASURED = (
+    "mean",
+    "coefficient_of_variation",
+    "coefficient_of_variation_without_drift",
+    "relative_power_4_8",
+    "relative_power_8_12",
+    "median_frequency",
+    "sample_entropy",
+    "tremor_frequency",
+)
+RESONANCES = ("resonance_frequency", "resonance_2_frequency")
+TRIALS_OF_TWO = 5  # in every condition of everybody, for a model with two resonances
+NAMES = ("person", "group", "condition", "trials")
+DROPPED = ("target", "group", "mvc_fraction")
+Whose = tuple[str, str]  # a person in a condition
+Numbers = Mapping[Whose, Number | None]
 
 
 class StudyResult(Result, eqx.Module):
     """What a study found.
 
-    `cohort`, the fits, one of each person in each condition; `cells`, one for each of them:
-    `person`, `group`, `condition`, how many `trials`, their sampling `rates` [Hz], and the `target`
-    made of them; `aic`, the summed AIC of every model that was tried (by rung), of which the lowest
-    was taken; the `options` as they were used; the `source` of the table.
+    `cells`, one for each person in each condition: `person`, `group`, `condition`, how many
+    `trials`, their sampling `rates` [Hz], and the `target` made of them, whose `measured` is what
+    needs no model; `cohort`, the fits, one of each cell, none where only measured was asked for;
+    `aic`, the summed AIC of every model that was tried (by rung), of which the lowest was taken;
+    the `options` as they were used; the `source` of the table.
     """
 
     cohort: CohortResult
@@ -68,7 +86,8 @@ class StudyResult(Result, eqx.Module):
 
     @property
     def rung(self) -> int:
-        """The model of all people: which rung of the ladder."""
+        """The model of all people: which rung of the ladder. Raises `ValueError` where none was
+        fitted."""
         return min(self.aic, key=lambda number: self.aic[number])
 
     @property
@@ -88,30 +107,83 @@ class StudyResult(Result, eqx.Module):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """What is compared: what was asked for, else the derived quantities but
-        `high_frequency_floor`.
+        """What is compared: what was asked for, else eight measured quantities and the frequencies
+        of the two resonances.
 
-        Of these, the ones that at least one fit determines.
+        Of these, the ones that are known of at least one person.
         """
+        return self._compared_names(self._known())
+
+    def _compared_names(self, known: Mapping[Any, Mapping[str, Any]]) -> tuple[str, ...]:
         asked = self.options["quantities"]
-        seen = {name for result in self.cohort.results.values() for name in result.determined}
-        return tuple(name for name in (COMPARED if asked is None else asked) if name in seen)
+        seen = {name for table in known.values() for name in table}
+        return tuple(n for n in ((*MEASURED, *RESONANCES) if asked is None else asked) if n in seen)
+
+    def _known(self) -> dict[Whose, dict[str, Number]]:
+        """What may be compared, of every person in every condition: what is measured, and what the
+        fit determines if its model describes the data."""
+        found = {}
+        for cell in self.cells:
+            result = self.cohort.results.get(cell.target.name)
+            measured = {n: m for n, m in cell.target.measured.items() if math.isfinite(m.value)}
+            of_model = {} if result is None or result.adequate is False else result.determined
+            found[cell.person, cell.condition] = measured | of_model
+        return found
+
+    def table_1(self) -> list[dict[str, Any]]:
+        """Mean and standard deviation over people of every measured quantity (but the p-value of
+        the tremor), by group and condition: the table that a paper begins with.
+
+        Rows `group`, `condition`, `quantity`, `mean`, `sd` (of n - 1 degrees of freedom, NaN of a
+        single person), `n`, how many people have it, of `people`, and the `unit`.
+        """
+        rows = []
+        for (group, condition), people in self._parts().items():
+            tables = [cell.target.measured for cell in people]
+            for quantity in dict.fromkeys(n for t in tables for n in t if n != "tremor_p"):
+                known = [table[quantity] for table in tables if quantity in table]
+                each = np.array([m.value for m in known if math.isfinite(m.value)])
+                said = {
+                    "mean": float(np.mean(each)) if each.size else math.nan,
+                    "sd": float(np.std(each, ddof=1)) if each.size > 1 else math.nan,
+                    "n": each.size,
+                    "people": len(tables),
+                    "unit": known[0].unit,
+                }
+                rows.append({"group": group, "condition": condition, "quantity": quantity} | said)
+        return rows
+
+    def _parts(self) -> dict[tuple[str, str], list[Cell]]:
+        """The people of every group in every condition."""
+        parts = {
+            (group, condition): [
+                cell for cell in self.cells if (cell.group, cell.condition) == (group, condition)
+            ]
+            for group in self.groups
+            for condition in self.conditions
+        }
+        return {key: people for key, people in parts.items() if people}
 
     def table(self) -> list[dict[str, Any]]:
-        """Tidy rows, one for each person, condition and quantity; `stderr` None where the data do
-        not determine it."""
+        """Tidy rows, one for each person, condition and quantity; `kind` "measured" or "model";
+        `stderr` None where there is none, of the model where the data do not determine it."""
         asked = self.options["quantities"]
-        cells = {cell.target.name: cell for cell in self.cells}
-        drop = ("target", "group", "mvc_fraction")
-        return [
-            {
-                label: getattr(cells[row["target"]], label)
-                for label in ("person", "group", "condition", "trials")
-            }
-            | {name: value for name, value in row.items() if name not in drop}
-            for row in self.cohort.table()
-            if asked is None or row["quantity"] in asked
-        ]
+        fitted = {name: [] for name in self.cohort.results}
+        for row in self.cohort.table():
+            if row["kind"] == "model":
+                fitted[row["target"]].append(row)
+        rows = []
+        for cell in self.cells:
+            own = {name: getattr(cell, name) for name in NAMES}
+            rows += [
+                own | {"quantity": name, "kind": "measured", **m.row()}
+                for name, m in cell.target.measured.items()
+            ]
+            rows += [
+                own | {name: value for name, value in row.items() if name not in DROPPED}
+                for row in fitted.get(cell.target.name, [])
+            ]
+        return [row for row in rows if asked is None or row["quantity"] in asked]
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """The rows of `table`."""
@@ -122,37 +194,39 @@ class StudyResult(Result, eqx.Module):
 
         Groups in each condition by Welch's t, conditions within people by the paired t, their
         interaction (the change from one condition to the other in one group against that in the
-        other) by Welch's t. `p_corrected` is for all comparisons of its kind. People whose fits do
-        not determine a quantity are `left_out` of it: a selection.
+        other) by Welch's t. `p_corrected` is for all comparisons of its kind, measured quantities
+        and those of the model apart. People of whom a quantity is not known are `left_out` of it, a
+        selection: of a tremor those who show none, of the model's numbers those whom it does not
+        describe or whose data do not determine it.
         """
-        kinds: dict[str, list[Difference]] = {}
-        for quantity in self.quantities:
-            for found in (*self._between_groups(quantity), *self._within_people(quantity)):
-                kinds.setdefault(found.kind, []).append(found)
+        known = self._known()
+        families: dict[Any, list[Difference]] = {}
+        for quantity in self._compared_names(known):
+            numbers = {whose: table.get(quantity) for whose, table in known.items()}
+            for found in (
+                *self._between_groups(quantity, numbers),
+                *self._within_people(quantity, numbers),
+            ):
+                families.setdefault((quantity in MEASURES, found.kind), []).append(found)
         correction = self.options["correction"]
-        return tuple(each for family in kinds.values() for each in corrected(family, correction))
+        return tuple(each for family in families.values() for each in corrected(family, correction))
 
-    def _between_groups(self, quantity: str) -> Iterable[Difference]:
+    def _between_groups(self, quantity: str, numbers: Numbers) -> Iterable[Difference]:
         for condition in self.conditions:
-            there = [cell for cell in self.cells if cell.condition == condition]
-            known = [(cell.group, self._number(quantity, cell)) for cell in there]
+            known = [
+                (cell.group, numbers[cell.person, condition])
+                for cell in self.cells
+                if cell.condition == condition
+            ]
             yield from self._compared(quantity, known, "groups", condition)
 
-    def _within_people(self, quantity: str) -> Iterable[Difference]:
-        cells = {(cell.person, cell.condition): cell for cell in self.cells}
+    def _within_people(self, quantity: str, numbers: Numbers) -> Iterable[Difference]:
         for a, b in itertools.combinations(self.conditions, 2):
-            both = [
-                (group, cells[person, a], cells[person, b])
-                for person, group in self.people.items()
-                if (person, a) in cells and (person, b) in cells
-            ]
-            pairs = [
-                (group, self._number(quantity, x), self._number(quantity, y))
-                for group, x, y in both
-            ]
-            changes = [
-                (group, None if x is None or y is None else change(x, y)) for group, x, y in pairs
-            ]
+            changes = []
+            for person, group in self.people.items():
+                if (person, a) in numbers and (person, b) in numbers:
+                    x, y = numbers[person, a], numbers[person, b]
+                    changes.append((group, None if x is None or y is None else change(x, y)))
             known = [each for _, each in changes if each is not None]
             if len(known) > 1:
                 found = paired(quantity, a, b, known, 1 - self.options["alpha"])
@@ -160,7 +234,7 @@ class StudyResult(Result, eqx.Module):
             yield from self._compared(quantity, changes, "interaction", f"{b} - {a}")
 
     def _compared(
-        self, quantity: str, numbers: list[tuple[str, Estimate | None]], kind: str, where: str
+        self, quantity: str, numbers: list[tuple[str, Number | None]], kind: str, where: str
     ) -> Iterable[Difference]:
         """Every two groups."""
         for pair in itertools.combinations(self.groups, 2):
@@ -172,10 +246,6 @@ class StudyResult(Result, eqx.Module):
                 left_out = sum(g in pair and e is None for g, e in numbers)
                 yield dataclasses.replace(found, kind=kind, where=where, left_out=left_out)
 
-    def _number(self, quantity: str, cell: Cell) -> Estimate | None:
-        result = self.cohort.results.get(cell.target.name)
-        return None if result is None else result.determined.get(quantity)
-
     def methods(self) -> str:
         """A paragraph for the methods section of a paper: people, recordings, spectra, model,
         statistics, versions."""
@@ -186,14 +256,21 @@ class StudyResult(Result, eqx.Module):
         `jaxmuscle.plot.study`."""
         return plot.study(self, ax, proportional=proportional)
 
+    def figures(self) -> dict[str, Any]:
+        """`spectra`, as `plot` draws them, and `quantities`, what is compared; not these where
+        nothing is known of half of the people."""
+        found = {"spectra": self.plot()}
+        with contextlib.suppress(ValueError):
+            found["quantities"] = plot.cohort(self._drawn(), "group", quantities=self.quantities)
+        return found
+
     def save(self, folder: str | os.PathLike[str], formats: Sequence[str] = ("png",)) -> None:
-        """Write people.csv, differences.csv, study.json, spectra.png, quantities.png and
-        methods.txt into `folder`.
+        """Write table1.csv, people.csv, differences.csv, study.json, spectra.png, quantities.png
+        and methods.txt into `folder`.
 
         They are made beside it first and then moved: a save that is interrupted changes nothing.
-        Without a comparison there is no differences.csv, and where the fits determine too little no
-        quantities.png. `formats` of the figures: "png", "pdf", "svg"; raises `ValueError` for
-        another.
+        Without a comparison there is no differences.csv. `formats` of the figures: "png", "pdf",
+        "svg"; raises `ValueError` for another.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -208,25 +285,56 @@ class StudyResult(Result, eqx.Module):
 
     def _write(self, folder: Path, formats: Sequence[str]) -> None:
         tables = {
+            "table1.csv": self.table_1(),
             "people.csv": self.table(),
             "differences.csv": [_row(d) for d in self.differences()],
         }
         for name, rows in tables.items():
             if rows:
-                write_text(folder / name, frame(rows).to_csv(index=False, float_format="%.8g"))
+                write_text(folder / name, frame(rows).to_csv(index=False, float_format="%.12g"))
         write_json(folder / "study.json", to_table(self))
         write_text(folder / "methods.txt", textwrap.fill(self.methods(), WIDTH) + "\n")
-        figures: dict[str, Any] = {"spectra": self.plot()}
-        with contextlib.suppress(ValueError):  # nothing that half of the targets determine
-            figures["quantities"] = plot.cohort(self.cohort, "group", quantities=self.quantities)
-        for name, figure in figures.items():
+        for name, figure in self.figures().items():
             write_figure(figure, folder, name, formats)
+
+    def _drawn(self) -> "_Drawn":
+        """What the figure of the quantities shows."""
+        known = self._known()
+        groups = {cell.target.name: _group_of(cell) for cell in self.cells}
+        rows = [
+            {
+                "target": cell.target.name,
+                "group": groups[cell.target.name],
+                "quantity": name,
+                "value": e.value,
+                "stderr": e.stderr,
+                "unit": e.unit,
+            }
+            for cell in self.cells
+            for name, e in known[cell.person, cell.condition].items()
+        ]
+        return _Drawn({cell.target.name: cell for cell in self.cells}, groups, rows)
 
     def _card(self) -> Card:
         return reports().study_card(self)
 
 
-FILES = ("people.csv", "differences.csv", "study.json", "methods.txt")
+FILES = ("table1.csv", "people.csv", "differences.csv", "study.json", "methods.txt")
+
+
+class _Drawn(NamedTuple):
+    """What `plot.cohort` reads of a cohort."""
+
+    results: dict[str, Cell]
+    groups: dict[str, str]
+    rows: list[dict[str, Any]]
+
+    def table(self) -> list[dict[str, Any]]:
+        return self.rows
+
+
+def _group_of(cell: Cell) -> str:
+    return ", ".join(filter(None, (cell.group, cell.condition)))
 
 
 def _row(difference: Difference) -> dict[str, Any]:
@@ -253,23 +361,25 @@ def _row(difference: Difference) -> dict[str, Any]:
 
 def to_table(study: StudyResult) -> dict[str, Any]:
     """What study.json holds."""
-    rows = [
-        {
-            name: with_nulls(value) if isinstance(value, float) else value
-            for name, value in _row(d).items()
-        }
-        for d in study.differences()
-    ]
+    rows = [_nulled(_row(d)) for d in study.differences()]
     return {
         "format": FORMAT,
         "source": study.source,
         "options": study.options,
-        "model": {"rung": study.rung, "name": RUNGS[study.rung]},
+        "model": {"rung": study.rung, "name": RUNGS[study.rung]} if study.aic else None,
         "aic": {str(number): with_nulls(aic) for number, aic in study.aic.items()},
+        "table_1": [_nulled(row) for row in study.table_1()],
         "fits": [_fit_to_table(cell, study.cohort) for cell in study.cells],
         "differences": rows,
         "methods": study.methods(),
         "versions": versions(),
+    }
+
+
+def _nulled(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: with_nulls(value) if isinstance(value, float) else value
+        for name, value in row.items()
     }
 
 
@@ -284,13 +394,13 @@ def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
         "source": target.source,
         "notices": list(target.notices),
         "dispersion": None if target.dispersion is None else target.dispersion[0],
-        "mean": target.mean,
         "unit": target.unit,
+        "measured": {name: _nulled(m.row()) for name, m in target.measured.items()},
         "frequency_hz": target.frequency.tolist(),
         "proportional_power": target.proportional_power.tolist(),
     }
     if result is None:
-        return own | {"failed": cohort.failed[target.name]}
+        return own | {"failed": cohort.failed.get(target.name)}
     return own | {
         "success": result.success,
         "verdict": result.verdict,
@@ -304,6 +414,7 @@ def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
 def run_study(  # noqa: PLR0913 (options of a public call)
     study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]",
     *,
+    fit: bool = True,
     rung: int | str | None = None,
     noise: str | None = None,
     quantities: Iterable[str] | None = None,
@@ -325,33 +436,39 @@ def run_study(  # noqa: PLR0913 (options of a public call)
     spectrum: str | None = None,
     mvc: float | int | None = None,
 ) -> StudyResult:
-    """Fit the recordings of a whole study with one model and compare groups and conditions.
+    """Measure the recordings of a whole study, fit them with one model, and compare groups and
+    conditions.
 
         found = jm.run_study("study.csv")
         print(found)
         found.save("results")
 
     The trials of a person in a condition make one target (`Trials.target`), each in its steady
-    part. All targets are fitted by `fit_cohort` with the same model, so that their numbers can be
-    compared.
+    part. What is measured of it is what `steadiness` measures. All targets are fitted by
+    `fit_cohort` with the same model, so that their numbers can be compared.
 
     **Arguments:**
 
     - `study`: one of three things. A table (.csv, .tsv, .txt) with a line for each recording. It
       has the columns file (relative to the table) and person; it may have group, condition, trial,
       window_start, window_stop and those of the last item but window. Or a .toml with `table =
-      "study.csv"` or `[[recordings]]` of the same fields, and any of the options below but
+      "study.csv"` or `[[recordings]]` of the same fields, and any of the options below but `fit`,
       `starts`, `key` and `progress`. Or rows, as dictionaries.
-    - `rung`: the model of all people (`on_rung`), 0 to 3; by default 2, with activation and tremor.
-      "auto" fits several and takes the one whose AIC, summed over all targets, is lowest; that is
-      three or four times as long.
+    - `fit`: False for the measured part alone, without any model.
+    - `rung`: the model of all people (`on_rung`), 0 to 3. By default 3, whose second resonance is
+      the slower rhythm, where everybody has five trials or more in every condition, else 2, with
+      activation and one resonance. "auto" fits several and takes the one whose AIC, summed over all
+      targets, is lowest; that is three or four times as long.
     - `noise`: as in `fit`; `starts` of each fit; `key` of its random numbers.
-    - `quantities`: what is reported and compared. By default the derived quantities but
-      `high_frequency_floor` are compared, and all quantities reported. The fewer, the less the
-      correction costs.
+    - `quantities`: what is reported and compared. By default all are reported, and compared are
+      eight measured ones (mean, coefficient of variation with and without drift, power over the
+      squared mean from 4 to 8 and from 8 to 12 Hz, median frequency, sample entropy, tremor
+      frequency) and the frequencies of the model's resonances. The fewer, the less the correction
+      costs.
     - `alpha`: level of the tests, by default 0.05. Intervals hold 1 - alpha.
     - `correction` for many comparisons: "holm" (default), "fdr" or "none". All comparisons of one
-      kind (groups, conditions, interaction) are corrected together.
+      kind (groups, conditions, interaction) are corrected together, measured quantities and those
+      of the model apart.
     - `progress`: True or a function of (text, share).
     - How files are read where a row does not say it: `window` (start, stop) [s] or "all" (by
       default the steady part); `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`,
@@ -397,14 +514,17 @@ def run_study(  # noqa: PLR0913 (options of a public call)
     with told(progress, f"study of {len({row.person for row in table.rows})} people") as tell:
         tell("reading recordings", 0.0)
         cells = cells_of_study(table.rows, usual)
-        cohort, aic = _fitted(cells, options, tell)
+        if options["rung"] is None:
+            fewest = min(cell.trials for cell in cells)
+            options["rung"] = 3 if fewest >= TRIALS_OF_TWO else 2
+        cohort, aic = _fitted(cells, options, tell) if fit else (CohortResult({}, {}, {}), {})
     return StudyResult(cohort, tuple(cells), aic, options | {"reading": usual}, table.source)
 
 
 def _checked(options: dict[str, Any]) -> dict[str, Any]:
     """The options, of whichever origin, fit for use."""
     rung, alpha, names = (options[name] for name in ("rung", "alpha", "quantities"))
-    if rung != AUTO and (isinstance(rung, bool) or rung not in range(len(RUNGS))):
+    if rung not in (AUTO, None) and (isinstance(rung, bool) or rung not in range(len(RUNGS))):
         raise ValueError(
             f'rung = {rung!r}: give a rung of the ladder, 0 to {len(RUNGS) - 1}, or "auto"'
         )
@@ -419,8 +539,9 @@ def _checked(options: dict[str, Any]) -> dict[str, Any]:
         )
     names = None if names is None else list(names)
     for name in names or ():
-        if name not in DERIVED and name not in PARAMETERS:
-            raise ValueError(f"quantities: unknown {name!r}; {choices(str(name), DERIVED)}")
+        known = (*MEASURES, *DERIVED, *PARAMETERS)
+        if name not in known:
+            raise ValueError(f"quantities: unknown {name!r}; {choices(str(name), known)}")
     return options | {
         "quantities": (
             None if names is None else list(dict.fromkeys(ALIASES.get(n, n) for n in names))
@@ -438,9 +559,7 @@ def _fitted(
     gains nothing ends it.
     """
     numbers = range(len(RUNGS)) if options["rung"] == AUTO else (options["rung"],)
-    labels = {
-        cell.target.name: ", ".join(filter(None, (cell.group, cell.condition))) for cell in cells
-    }
+    labels = {cell.target.name: _group_of(cell) for cell in cells}
     tried: dict[int, CohortResult] = {}
     aic: dict[int, float] = {}
     for number in numbers:

@@ -1,7 +1,7 @@
 """The tables of a fit's result: parameters and derived quantities with their errors, what the data
 determine of them."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,13 +10,13 @@ import numpy as np
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import SAME, base_of
 from jaxmuscle.objective._covariance import Identifiability, common_scales
-from jaxmuscle.objective._derived import derived_names, unit_of
+from jaxmuscle.objective._derived import MEAN, VARIATION, derived_names, unit_of
 from jaxmuscle.objective._problem import FitProblem, Part
 
 from ._intervals import Interval
 from ._part import Estimate
 
-OUTPUTS = ("coefficient_of_variation", "mean")
+OUTPUTS = (VARIATION, MEAN)
 BASE = {"K_w0": "k_w", "K_z0": "k_z", "C_w0": "c_w", "C_z0": "c_z"}
 STRAIGHT = 0.25  # error of a log up to which a quantity is as good as linear
 VAGUE = 100.0  # from the lower to the upper end of an interval
@@ -156,10 +156,10 @@ def without_errors(names: Collection[str], table: dict[str, Estimate]) -> dict[s
     }
 
 
-def widened(table: dict[str, Estimate], factor: Callable[[str], float]) -> dict[str, Estimate]:
-    """The table with the standard error of every name multiplied."""
+def widened(table: dict[str, Estimate], factor: float) -> dict[str, Estimate]:
+    """The table with every standard error multiplied."""
     return {
-        n: p if p.stderr is None else eqx.tree_at(lambda e: e.stderr, p, factor(n) * p.stderr)
+        n: p if p.stderr is None else eqx.tree_at(lambda e: e.stderr, p, factor * p.stderr)
         for n, p in table.items()
     }
 

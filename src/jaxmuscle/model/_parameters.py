@@ -204,7 +204,7 @@ PARAMETERS: dict[str, Parameter] = {
             "σ_1",
             "1",
             0.005,
-            "tremor of the drive, a fraction of P_w",
+            "resonance of the drive (a tremor), a fraction of P_w",
             _HUMAN,
         ),
         _row(
@@ -212,7 +212,7 @@ PARAMETERS: dict[str, Parameter] = {
             "f_1",
             "Hz",
             9.0,
-            "frequency of the tremor",
+            "frequency of the resonance",
             _TREMOR,
             sd=0.25,
             fit_lower=0.5,
@@ -223,7 +223,7 @@ PARAMETERS: dict[str, Parameter] = {
             "b_1",
             "Hz",
             2.0,
-            "full width of the tremor at half power",
+            "full width of the resonance at half power",
             _TREMOR,
             sd=0.7,
             fit_lower=0.02,
@@ -367,11 +367,7 @@ def amplitude_names(task: Any) -> tuple[str, ...]:
 
 OFF = ("activation_time", "noise_P_w")
 # What a result calls by the name that people use.
-SYNONYMS = {
-    "tremor_frequency": "resonance_frequency",
-    "tremor_width": "resonance_width",
-    "contraction_time": "activation_time",
-}
+SYNONYMS = {"contraction_time": "activation_time"}
 BASE = {
     "K_w0": "k_w x_ref_w^2",
     "K_z0": "k_z x_ref_z^2",
@@ -381,8 +377,8 @@ BASE = {
 
 
 def proper(name: str) -> str:
-    """The name of a parameter in the parameter table: that of "tremor_width" is "resonance_width";
-    of one target's, too."""
+    """The name of a parameter in the parameter table: that of "contraction_time" is
+    "activation_time"; of one target's, too."""
     own, at, target = name.partition("@")
     return SYNONYMS.get(own, own) + at + target
 

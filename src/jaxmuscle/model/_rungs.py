@@ -8,11 +8,11 @@ from ._tasks import AbstractTask
 RUNGS = (
     "base: noise and a harmonic",
     "with activation",
-    "with tremor instead of the harmonic",
+    "with a resonance instead of the harmonic",
     "with a second resonance",
 )
 # what a comparison calls them, with the task's own noise
-RICHER = {"activation": 1, "tremor": 2, "two resonances": 3}
+RICHER = {"activation": 1, "resonance": 2, "two resonances": 3}
 QUIET, NOISE_ALONE = -1, "noise alone"  # below the base model
 
 
@@ -24,11 +24,11 @@ def rung_name(rung: int) -> str:
 def on_rung(task: AbstractTask, rung: int) -> AbstractTask:
     """The task with what measured force asks for beyond the base model, by `rung`:
 
-        task = jm.on_rung(jm.Isometric(), 2)  # with activation and tremor
-        task["tremor_frequency"]
+        task = jm.on_rung(jm.Isometric(), 2)  # with activation and a resonance
+        task["resonance_frequency"]
 
     0, as it is; 1, with an `Activation` between the nervous drive and the active tissue; 2, with a
-    `ResonantNoise` on the drive as well, the tremor, instead of the harmonic; 3, with a second
+    `ResonantNoise` on the drive as well instead of the harmonic; 3, with a second
     resonance. Each begins at the default of the parameter table.
 
     **Raises:** `ValueError` for other rungs, and for a task that has an activation or a resonance

@@ -18,32 +18,32 @@ from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._fluctuations import BANDS, EDGES, in_bands
 
 TANGENTS = ("K_w_tangent", "tangent_stiffness")
+MEAN, VARIATION = "model_mean", "model_coefficient_of_variation"
 DERIVED = (
     "corner_frequency",
     "half_power_frequency",
     "contraction_time",
-    "tremor_frequency",
-    "tremor_width",
-    "tremor_share",
+    "resonance_frequency",
+    "resonance_width",
+    "resonance_share",
     "resonance_2_share",
     "harmonic_share",
     "harmonic_frequency",
-    "high_frequency_floor",
     "K_w0",
     "K_z0",
     "C_w0",
     "C_z0",
     *TANGENTS,
-    "coefficient_of_variation",
-    "mean",
+    VARIATION,
+    MEAN,
     *BANDS,
 )
 UNITS = {
     "corner_frequency": "Hz",
     "half_power_frequency": "Hz",
     "contraction_time": "s",
-    "tremor_frequency": "Hz",
-    "tremor_width": "Hz",
+    "resonance_frequency": "Hz",
+    "resonance_width": "Hz",
     "harmonic_frequency": "Hz",
     "K_w0": "N/m",
     "K_z0": "N/m",
@@ -58,22 +58,21 @@ MEANINGS = {
     "corner_frequency": "where the slow response of the muscle falls off",
     "half_power_frequency": "where muscle and activation together let half the power through",
     "contraction_time": "contraction time of a twitch",
-    "tremor_frequency": "frequency of the tremor in the drive, before the muscle smooths it",
-    "tremor_width": "full width of the tremor at half power",
-    "tremor_share": "the tremor's share of the power, counted from half its frequency on",
+    "resonance_frequency": "frequency of the resonance in the drive, before the muscle smooths it",
+    "resonance_width": "full width of the resonance at half power",
+    "resonance_share": "the resonance's share of the power, counted from half its frequency on",
     "resonance_2_share": (
         "the second resonance's share of the power, counted from half its frequency on"
     ),
     "harmonic_share": "the harmonic's share of the power",
-    "high_frequency_floor": "mean power of the highest third of the bins, a tremor included",
     "K_w0": "active stiffness without stretch",
     "K_z0": "passive stiffness without stretch",
     "C_w0": "active damping when nothing moves",
     "C_z0": "passive damping when nothing moves",
     "K_w_tangent": "active stiffness as displaced in the hold",
     "tangent_stiffness": "stiffness of both tissues in series, H(0)",
-    "coefficient_of_variation": "standard deviation over mean of the output",
-    "mean": "mean of the output",
+    VARIATION: "standard deviation over mean of the model's output",
+    MEAN: "mean of the model's output",
     **{
         name: f"share of the power from {low:g} to {high:g} Hz"
         for name, (low, high) in BANDS.items()
@@ -84,13 +83,12 @@ MEANINGS = {
 OF_SPECTRUM = {
     "harmonic_share",
     "harmonic_frequency",
-    "high_frequency_floor",
-    "tremor_frequency",
-    "tremor_width",
-    "tremor_share",
+    "resonance_frequency",
+    "resonance_width",
+    "resonance_share",
     "resonance_2_share",
-    "coefficient_of_variation",
-    "mean",
+    VARIATION,
+    MEAN,
     *BANDS,
 }
 
@@ -113,13 +111,13 @@ def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
     missing = set(BANDS) - bands | (set() if spectrum else OF_SPECTRUM)
     missing |= set() if task.activation is not None else {"contraction_time"}
     missing |= set() if has_tangents(task) else {*TANGENTS}
-    missing |= {"tremor_frequency", "tremor_width", "tremor_share"} if resonances < 1 else set()
+    missing |= (
+        {"resonance_frequency", "resonance_width", "resonance_share"} if resonances < 1 else set()
+    )
     missing |= {"resonance_2_share"} if resonances < 2 else set()
     # About a mean of zero, and where the response begins with f².
     missing |= (
-        {"coefficient_of_variation", "mean", "half_power_frequency"}
-        if task.quantity == "acceleration"
-        else set()
+        {VARIATION, MEAN, "half_power_frequency"} if task.quantity == "acceleration" else set()
     )
     return tuple(name for name in DERIVED if name not in missing)
 
@@ -153,15 +151,14 @@ def derived(
 
     `corner_frequency` |λ_slow|/2π of the operating point; `half_power_frequency` of the slow part,
     relaxation and activation together; `contraction_time`, where there is an activation; where
-    there is a resonance `tremor_frequency`, `tremor_width` and `tremor_share` of the compared
-    power, and `resonance_2_share` of a second one, both from half the resonance's frequency on
-    (what activation and muscle let through below is no peak and can hardly be told from the rest);
-    `harmonic_share` of the compared power; `harmonic_frequency`; `high_frequency_floor`, mean
-    proportional power per bin over the highest third of the bins; the base coefficients; where the
-    insertion is moved `tangents`; `coefficient_of_variation` and `mean` of the output (not of an
-    acceleration, whose mean is zero, and which has no `half_power_frequency`); `band_4_8` and so
-    on, the proportional power from 4 to 8 Hz, of bins at the edges the part that lies inside, where
-    the bins cover half of the band.
+    there is a resonance `resonance_frequency`, `resonance_width` and `resonance_share` of the
+    compared power, and `resonance_2_share` of a second one, both from half the resonance's
+    frequency on (what activation and muscle let through below is no peak and can hardly be told
+    from the rest); `harmonic_share` of the compared power; `harmonic_frequency`; the base
+    coefficients; where the insertion is moved `tangents`; `model_coefficient_of_variation` and
+    `model_mean` of the output (not of an acceleration, whose mean is zero, and which has no
+    `half_power_frequency`); `band_4_8` and so on, the proportional power from 4 to 8 Hz, of bins at
+    the edges the part that lies inside, where the bins cover half of the band.
     """
     base, seen = task.muscle.base(), observed(moments)
     # of the bins, if not all are compared
@@ -175,10 +172,13 @@ def derived(
     if task.activation is not None:
         found["contraction_time"] = task.activation.time * one
     for name, noise, own in zip(
-        ("tremor", "resonance_2"), resonances, moments.resonant, strict=False
+        ("resonance", "resonance_2"), resonances, moments.resonant, strict=False
     ):
-        if name == "tremor":
-            found |= {"tremor_frequency": noise.frequency * one, "tremor_width": noise.width * one}
+        if name == "resonance":
+            found |= {
+                "resonance_frequency": noise.frequency * one,
+                "resonance_width": noise.width * one,
+            }
         peak = at >= 0.5 * jax.lax.stop_gradient(noise.frequency)
         found[f"{name}_share"] = jnp.sum(jnp.where(peak, own, 0.0)) / whole
     proportional = moments.power / whole
@@ -187,26 +187,23 @@ def derived(
     found |= {
         "harmonic_share": seen["harmonic_share"],
         "harmonic_frequency": task.harmonic.frequency * jnp.ones(()),
-        "high_frequency_floor": seen["high_frequency_floor"],
         "K_w0": base[0],
         "K_z0": base[1],
         "C_w0": base[2],
         "C_z0": base[3],
-        "coefficient_of_variation": seen["coefficient_of_variation"],
-        "mean": seen["mean"],
+        VARIATION: seen[VARIATION],
+        MEAN: seen[MEAN],
     }
-    found |= tangents(task, seen["mean"]) if has_tangents(task) else {}
+    found |= tangents(task, seen[MEAN]) if has_tangents(task) else {}
     return {name: value for name, value in found.items() if name in derived_names(task)}
 
 
 def observed(moments: Moments) -> dict[str, Any]:
     """Those derived quantities that follow from simulated moments."""
-    upper = moments.power.shape[0] // 3
     return {
         "harmonic_share": moments.line.sum() / moments.power.sum(),
-        "high_frequency_floor": moments.proportional[-upper:].mean(),
-        "coefficient_of_variation": moments.variation,
-        "mean": moments.mean,
+        VARIATION: moments.variation,
+        MEAN: moments.mean,
     }
 
 
@@ -229,7 +226,7 @@ def unit_of(name: str, output: str = "") -> str:
     """Unit of a parameter or derived quantity, "name@target" too; `output` is that of the task's
     output."""
     base = name.partition("@")[0]
-    if base == "mean":
+    if base == MEAN:
         return output
     if base in DERIVED:
         return UNITS.get(base, "1")

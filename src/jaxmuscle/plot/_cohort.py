@@ -123,7 +123,10 @@ def _drawn(cohort: Any, quantities: Collection[str] | None) -> dict[str, list[di
     """The rows of every quantity that at least half of the targets determine."""
     found: dict[str, list[dict[str, Any]]] = {}
     for row in cohort.table():
-        if row["stderr"] is not None and (quantities is None or row["quantity"] in quantities):
+        name = row["quantity"]
+        # the bands of the fit repeat the measured shares
+        asked = not name.startswith("band_") if quantities is None else name in quantities
+        if row["stderr"] is not None and asked:
             found.setdefault(row["quantity"], []).append(row)
     enough = SHARE * max(len(cohort.results), 1)
     found = {name: rows for name, rows in found.items() if len(rows) >= enough}

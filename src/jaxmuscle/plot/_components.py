@@ -15,12 +15,12 @@ PARTS = {
     "floor": ("0.75", "floor"),
     "relaxation": (SKY, "relaxation"),
     "harmonic": (ORANGE, "harmonic"),
-    "tremor": (GREEN, "tremor (all bins)"),
+    "resonance": (GREEN, "resonance (all bins)"),
     "resonance_2": (PURPLE, "resonance 2 (all bins)"),
 }
 RHYTHMS = {
     "harmonic": "harmonic",
-    "tremor": "tremor in the drive",
+    "resonance": "resonance in the drive",
     "resonance_2": "resonance 2 in the drive",
 }
 LEAST = 1e-4  # share of the power below which a part is not drawn
@@ -110,9 +110,9 @@ def components(
     """Draws what the parts of the model hold of the fitted power: they add up to the fit.
 
     The floor is from noise on the passive tissue, the relaxation from noise on the active one.
-    Harmonic, tremor and second resonance are drawn where the model has them. Those of the two
-    resonances hold all of their power, also that far below their peaks; a result's `tremor_share`
-    counts from half the tremor's frequency on.
+    Harmonic, resonance and second resonance are drawn where the model has them. Those of the two
+    resonances hold all of their power, also that far below their peaks; a result's
+    `resonance_share` counts from half its frequency on.
 
     **Arguments:**
 

@@ -25,6 +25,15 @@ def quantity(estimate: Any) -> tuple[str, str, str]:
     return f"{value:#.3g}".rstrip("."), error, unit_in_print(estimate.unit, power)
 
 
+BAND = re.compile(
+    r"(?P<kind>band|share|relative_power|power)_(?P<low>[\d.]+|above)_(?P<high>[\d.]+)"
+)
+KINDS = {
+    "band": "power",
+    "share": "share of variance",
+    "relative_power": "power over mean²",
+    "power": "power",
+}
 DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
@@ -44,7 +53,8 @@ def unit_in_print(unit: str, power: int = 0) -> str:
 def in_words(name: str, unit: str) -> str:
     """A quantity as the label of an axis; what has no unit is a ratio."""
     base, at, target = name.partition("@")
-    low, _, high = base.removeprefix("band_").partition("_")
     words = base if base[1:2] == "_" else base.replace("_", " ")
-    words = f"power, {low} to {high}\N{NO-BREAK SPACE}Hz" if base.startswith("band_") else words
+    if found := BAND.fullmatch(base):
+        low, high = (12, 30) if found["low"] == "above" else (found["low"], found["high"])
+        words = f"{KINDS[found['kind']]}, {low} to {high}\N{NO-BREAK SPACE}Hz"
     return f"{words}{at}{target} ({'ratio' if unit in ('', '1') else unit_in_print(unit)})"

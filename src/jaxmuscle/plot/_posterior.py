@@ -32,8 +32,7 @@ ORDER = (
     "corner_frequency",
     "harmonic_frequency",
     "harmonic_share",
-    "high_frequency_floor",
-    "coefficient_of_variation",
+    "model_coefficient_of_variation",
 )
 MOST, PAIRS = 6, 4  # quantities that are drawn; those of which all pairs have room in a column
 CUT = (0.002, 0.998)

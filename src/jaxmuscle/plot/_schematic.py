@@ -155,8 +155,8 @@ def _noise(model: Any, numbers: Mapping[str, Any]) -> dict[str, list[str]]:
             name = f"{prefix}_{channel}"
             if name in numbers and numbers[name].value != 0:
                 amount = _share(name, numbers) if part.relative else _in_words(name, numbers)
-                tremor = f"tremor {amount} at {_in_words(f'{prefix}_frequency', numbers)}"
-                words = tremor if part.sort == "resonance" else f"noise {amount}"
+                rhythm = f"resonance {amount} at {_in_words(f'{prefix}_frequency', numbers)}"
+                words = rhythm if part.sort == "resonance" else f"noise {amount}"
                 found["P_w" if channel == "amplitude" else channel].append(words)
     return found
 
@@ -344,7 +344,7 @@ def _forces(ax: Axes, ink: Any, roles: Mapping[str, Any], numbers: Mapping[str, 
     """P_w and F_ext beside their arrows; the mean of F_ext where a fit knows it."""
     drive = re.sub(r"(?<= )1\b", "× mean", _in_words("P_w", numbers))  # per newton of mean force
     _write(ax, (MIDDLE_W, 0.0), 0.6, f"{_symbol('P_w')}  {drive}".rstrip(), roles.get("P_w", ink))
-    outside = _in_words("F_ext", numbers) or _in_words("mean", numbers) * (
+    outside = _in_words("F_ext", numbers) or _in_words("model_mean", numbers) * (
         roles.get("F_ext") == VERMILLION
     )
     where, color = ((Z + HALF + END - 2.6) / 2, 0.0), roles.get("F_ext", ink)

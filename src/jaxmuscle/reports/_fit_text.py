@@ -1,17 +1,21 @@
 """The result of a fit as text, and as a table in a notebook."""
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 
 from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import folded
+from jaxmuscle.data._measured import is_recorded, tremor_band
+from jaxmuscle.data._measured_text import measured_line, tremor_lines
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._part import RELATIVE, Estimate, FittedPart, as_people_say, once
+from jaxmuscle.fits._part import RELATIVE, Estimate, FittedPart, once
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._derived import MEANINGS
+from jaxmuscle.objective._derived import MEAN, MEANINGS, VARIATION
+from jaxmuscle.spectra._bin_law import ENOUGH
 from jaxmuscle.spectra._fluctuations import BANDS, in_bands
 
 from ._ladder_text import gain_sentences, ladder_table, skipped_models
@@ -19,25 +23,51 @@ from ._ladder_text import gain_sentences, ladder_table, skipped_models
 LENGTHS = ("x_ref_w", "x_ref_z")
 OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
 BROAD = 1.7 * 3.92  # standard errors: an interval that is wider than theirs
+# measured numbers that a fit prints
+SHOWN = {
+    "mean": "mean",
+    "standard_deviation": "standard deviation",
+    "coefficient_of_variation": "coefficient of variation",
+    "coefficient_of_variation_without_drift": "  without a straight drift",
+    "relative_power_4_8": "power 4-8 Hz, 1e-6 mean²",
+    "relative_power_8_12": "power 8-12 Hz, 1e-6 mean²",
+    "median_frequency": "median frequency",
+    "sample_entropy": "sample entropy",
+}
+HALF_POWER = "half_power_frequency"
+STATED = ("resonance_frequency", "resonance_2_frequency", "harmonic_frequency", HALF_POWER)
+CAVEAT = "beside a strong tremor its interval is too narrow"
+WITHIN = "± is from within the recording: between trials of one person we saw about twice as much"
+CHOSEN = (
+    "the model was chosen for this target alone: do not compare its numbers between fits;"
+    " `jaxmuscle study` fits all people with one model"
+)
+EVERYTHING = (
+    "all other numbers of the model: `jaxmuscle fit --all`, fit.json; in Python result.details()"
+)
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 
 
 def fit_card(result: FitResult) -> Card:
-    """The result as text, and as a table of all its numbers: those that the data determine first,
-    then what was fixed."""
-    rows = []
+    """The result as text, and as a table of all its numbers: those that are measured first, then
+    those that the data determine, at last what was fixed."""
+    rows = [
+        (name, m.in_words(), m.interval_in_words(), "" if m.unit == "1" else m.unit, "measured", "")
+        for name, m in result.measured.items()
+    ]
     # then it has no frequency
     silent = all(float(part.task.harmonic.amplitude) == 0 for part in result.parts.values())
     fixed = {name: p for name, p in result.parameters.items() if not p.free}
+    of_model = []
     for name, p in result.as_shown(once(fixed, result.found)).items():
         if silent and base_of(name).startswith("harmonic_"):
             continue
         state = ("determined" if p.stderr is not None else "not determined") if p.free else "fixed"
         row, unit = PARAMETERS.get(base_of(name)), "" if p.unit == "1" else p.unit
         words = MEANINGS.get(base_of(name), "") if row is None else row.meaning.partition(";")[0]
-        rows.append((name, p.in_words(), p.interval_in_words(), unit, state, words))
+        of_model.append((name, p.in_words(), p.interval_in_words(), unit, state, words))
     order = ("determined", "not determined", "fixed")
-    rows.sort(key=lambda row: order.index(row[4]))
+    rows += sorted(of_model, key=lambda row: order.index(row[4]))
     remarks = (
         f"{_head(result)}: {result.message}",
         *_gains(result),
@@ -46,7 +76,7 @@ def fit_card(result: FitResult) -> Card:
         *result.remarks,
         *_held(result),
     )
-    return Card(_text(result), _heading(result), COLUMNS, tuple(rows), remarks)
+    return Card(fit_text(result), _heading(result), COLUMNS, tuple(rows), remarks)
 
 
 def _heading(result: FitResult) -> str:
@@ -57,11 +87,53 @@ def _heading(result: FitResult) -> str:
     return f"{subject} {result.verdict}"
 
 
-def _text(result: FitResult) -> str:
-    """The verdict, what the data determine and what they do not, and what to know about it."""
-    single = len(result.parts) == 1
-    lines = [_heading(result), f"  {_head(result)}"]
+def fit_text(result: FitResult, *, everything: bool = False) -> str:
+    """What is measured, whether the model describes it, and what then is known of the model: of
+    recordings its rhythms, of a spectrum its parameters; or everything.
+
+    The numbers of a model that does not describe the data are shown with everything only.
+    """
+    lines = [_head(result), *_measured(result), _heading(result)]
     lines += [f"  {result.message}"] * result.success
+    if everything:
+        lines += [f"  {row}" for row in ladder_table(result.ladder, _datum(result))]
+        lines += [f"  {sentence}" for sentence in skipped_models(result.ladder)]
+        lines += [f"  {sentence}" for sentence in _gains(result)]
+    lines += _fitted_targets(result)
+    lines += [f"  {sentence}" for sentence in result.advice]
+    # the short text has no contraction time
+    notices = [n for n in result.notices if everything or not n.startswith("contraction_time")]
+    lines += [f"  note: {notice}" for notice in notices]
+    lines += [f"  {sentence}" for sentence in result.remarks]
+    if everything or result.adequate is not False:
+        whole = everything or len(result.parts) > 1 or result.only.stiffness is not None
+        lines += _whole_model(result, everything) if whole else _short_model(result)
+    return folded(lines)
+
+
+def _measured(result: FitResult) -> list[str]:
+    """The measured numbers that people state, of every target."""
+    lines, several = [], len(result.parts) > 1
+    for name, part in result.parts.items():
+        target, found = part.target, part.target.measured
+        if not found:
+            continue
+        of = f" of {name}" * several
+        lines.append(f"{f'  measured{of}, without the model:':<56} 95 % interval")
+        rows = [
+            measured_line(words, key, found[key]) for key, words in SHOWN.items() if key in found
+        ]
+        rows += tremor_lines(found, tremor_band(target.quantity)) if "tremor_p" in found else []
+        lines += [f"    {row}" for row in rows]
+        if is_recorded(found) and len(target.segments or ()) < ENOUGH:
+            lines.append(f"    {WITHIN}")
+    return lines
+
+
+def _fitted_targets(result: FitResult) -> list[str]:
+    """How many trials every target has, and how well it is met."""
+    single = len(result.parts) == 1
+    lines = []
     if not single:
         lines += [
             f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}"
@@ -72,11 +144,6 @@ def _text(result: FitResult) -> str:
         for name, p in result.parts.items()
         for words in _trials(p.target)
     ]
-    lines += [f"  {row}" for row in ladder_table(result.ladder, _datum(result))]
-    lines += [f"  {sentence}" for sentence in skipped_models(result.ladder)]
-    lines += [f"  {sentence}" for sentence in _gains(result)]
-    lines += [f"  {sentence}" for sentence in result.advice]
-    lines += [f"  note: {notice}" for notice in result.notices]
     if single and result.rms_log_error is not None:
         lines.append(f"  {_closeness(result.only, verdict=result.closeness)}")
     lines += [
@@ -84,7 +151,51 @@ def _text(result: FitResult) -> str:
         for name, p in result.parts.items()
         for words in _stiffness(p)
     ]
-    lines += [f"  {sentence}" for sentence in result.remarks]
+    return lines
+
+
+def _short_model(result: FitResult) -> list[str]:
+    """The rhythms, and where half of the power is let through; of a spectrum without recordings
+    also the parameters."""
+    every, shown = result.as_shown(result.found), result.as_shown(result.determined)
+    rows = {name: p for name, p in shown.items() if base_of(name) in STATED}
+    lines = _table("of the model", rows, " 95 % interval") if rows else []
+    if HALF_POWER in rows and ("resonance_share" in every or _trembles(result)):
+        lines.append(f"  {HALF_POWER}: {CAVEAT}")
+    bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
+    lines += [f"  {sentence}" for sentence in _by_band(result, bands)]
+    if not is_recorded(result.target.measured):
+        own = {n: p for n, p in every.items() if n in result.free and n not in rows}
+        known = [_in_short(n, p) for n, p in own.items() if p.stderr is not None]
+        loose = [_in_short(n, p) for n, p in own.items() if p.stderr is None]
+        of = _per_newton(result, own)
+        lines += [f"  parameters{of}: {', '.join(known)}"] * bool(known)
+        lines += [f"  not determined, one of many sets that fit{of}: {', '.join(loose)}"] * bool(
+            loose
+        )
+        lines += [f"  {sentence}" for sentence in _of_scale(result)]
+        every = {n: p for n, p in every.items() if n not in own}
+    elif len(result.ladder) > 1:
+        lines.append(f"  {CHOSEN}")
+    if loose := [n for n, p in every.items() if p.stderr is None and p.free]:
+        lines.append(f"  the data do not determine: {', '.join(loose)}")
+    return [*lines, f"  {EVERYTHING}"]
+
+
+def _trembles(result: FitResult) -> bool:
+    """Whether a tremor is measured."""
+    found = result.target.measured.get("tremor_frequency")
+    return found is not None and math.isfinite(found.value)
+
+
+def _in_short(name: str, p: Estimate) -> str:
+    unit = "" if p.unit in ("1", "") else f" {p.unit}"
+    return f"{name} {p.in_words()}{unit}"
+
+
+def _whole_model(result: FitResult, everything: bool) -> list[str]:
+    """All that the data determine; with everything also what they do not, and what they leave
+    open."""
     every, shown = result.as_shown(result.found), result.as_shown(result.determined)
     intervals = any(p.interval is not None for p in shown.values())
     bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
@@ -94,42 +205,45 @@ def _text(result: FitResult) -> str:
         if result.adequate is not False
         else "would be determined if the model held"
     )
-    lines += _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
+    lines = _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
     lines += [f"  {sentence}" for sentence in (*_counted(rows, every), *_by_band(result, bands))]
-    fixed = [name for name in result.products if name not in result.parameters]
-    said = (
-        "products and ratios that the data determine, though not each factor alone (jaxmuscle"
-        " identifiability has values)"
-    )
-    lines += [f"  {said}: {', '.join(map(as_people_say, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
-    title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
-    lines += _table(title, loose) if loose else []
-    lines += [f"  {sentence}" for sentence in _counted(loose, every)]
+    if loose and everything:
+        title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
+        lines += [*_table(title, loose), *(f"  {sentence}" for sentence in _counted(loose, every))]
+    elif loose:
+        lines.append(f"  the data do not determine: {', '.join(loose)}")
+    lines += [f"  {sentence}" for sentence in _of_scale(result)]
+    if result.undetermined and everything:
+        whose = "the data leave" if len(result.parts) == 1 else "all targets together leave"
+        lines += [f"  {whose} open:", *(f"    - {sentence}" for sentence in result.undetermined)]
+    return lines if everything else [*lines, f"  {EVERYTHING}"]
+
+
+def _of_scale(result: FitResult) -> list[str]:
+    """What the scale of force stands on, and what was held."""
+    lines = []
     if factor := result.settings.get("carried"):
         moved = any(part.stiffness is not None for part in result.parts.values())
         what = "P_w, stiffness" if moved else "P_w, masses (those that you did not fix), stiffness"
-        lines += [
-            f"  before the fit {what} and damping were multiplied by {factor:.3g}, so that the"
+        lines.append(
+            f"before the fit {what} and damping were multiplied by {factor:.3g}, so that the"
             " muscle has the measured mean force"
             + " (mean_force=False leaves the mean out)"
             * (not moved)
-        ]
-    lines += [f"  {sentence}" for sentence in _held(result)]
+        )
+    lines += _held(result)
     if result.per_newton:
-        mean = f"{result.derived['mean'].value:.3g} N"
+        mean = f"{result.derived[MEAN].value:.3g} N"
         torque = any(part.target.quantity == "torque" for part in result.parts.values())
         given = " (of a torque it needs the lever arm: --lever-arm)" * torque
-        lines += [
-            f"  no mean force in newtons was given{given}, so the scale of force is unknown."
+        lines.append(
+            f"no mean force in newtons was given{given}, so the scale of force is unknown."
             " Forces, masses, stiffness and damping are stated here per newton of mean force. In"
             " fit.json (Python: result['K_w0'], to_dataframe()) they are those of a model muscle"
             f" that pulls with {mean}: divide by {mean}"
-        ]
-    if result.undetermined:
-        whose = "the data leave" if single else "all targets together leave"
-        lines += [f"  {whose} open:", *(f"    - {sentence}" for sentence in result.undetermined)]
-    return folded(lines)
+        )
+    return lines
 
 
 def _held(result: FitResult) -> list[str]:
@@ -232,7 +346,7 @@ def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str
 def _beside(name: str, p: Estimate) -> str:
     """What stands behind a number: its unit; a variation in percent, too."""
     base, at, _ = name.partition("@")
-    if base == "coefficient_of_variation":
+    if base == VARIATION:
         return f"{'' if at else '= '}{100 * p.value:.3g} %"
     # A parameter of an own muscle has a unit that only its author knows: it is never divided by a
     # force.
@@ -251,16 +365,10 @@ def _counted(shown: Mapping[str, Estimate], every: Mapping[str, Estimate]) -> li
         )
     for name in shown:
         base, at, target = name.partition("@")
-        rhythm = every.get(f"tremor_frequency{at}{target}")
-        if base == "tremor_share" and rhythm is not None:
+        rhythm = every.get(f"resonance_frequency{at}{target}")
+        if base == "resonance_share" and rhythm is not None:
             sentences.append(
-                f"{name}: counted from {0.5 * rhythm.value:.2g} Hz on, half of the tremor's"
-                " frequency"
-            )
-        if base == "high_frequency_floor" and rhythm is not None:
-            sentences.append(
-                f"{name}: is the mean of the highest third of the bins, tremor included. Do not"
-                " report it beside the tremor"
+                f"{name}: counted from {0.5 * rhythm.value:.2g} Hz on, half of its frequency"
             )
     return sentences
 

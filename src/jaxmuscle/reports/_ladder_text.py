@@ -49,7 +49,7 @@ def gain_sentences(
     )
     if any(after.aic > before.aic for before, after in itertools.pairwise(climbed)) and number > 0:
         meaning += (
-            ". A richer model can fit worse here, since models with activation or tremor keep"
+            ". A richer model can fit worse here, since models with activation or resonance keep"
             " stiffness and damping nearer to their usual values"
         )
     if describes is False:

@@ -10,6 +10,7 @@ import scipy
 
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.text import probability
+from jaxmuscle.data._measured import is_recorded, tremor_band
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.spectra._settings import SpectrumSettings
@@ -17,6 +18,7 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 from ._study_text import counted, people_in_words, range_of, trials_in_words
 
 if TYPE_CHECKING:
+    from jaxmuscle.data._target import Target
     from jaxmuscle.fits._result import FitResult
     from jaxmuscle.fits._study import StudyResult
 
@@ -52,34 +54,61 @@ def study_methods(study: "StudyResult") -> str:
         f"{window[0]:g} s to {window[1]:g} s" if isinstance(window, tuple | list) else named[window]
     )
     whose = "person and condition" if any(study.conditions) else "person"
-    noise = "" if study.options["noise"] is None else f" with {study.options['noise']} noise"
+    used = versions() if study.aic else {n: versions()[n] for n in ("jaxmuscle", "numpy")}
     said = [
         f"We analysed {people_in_words(study)}: {trials_in_words(study)}.",
         (
-            f"Recordings (sampled at {range_of(rates)} Hz) were resampled to {s.rate:g} Hz and"
+            f"Recordings of {study.cells[0].target.quantity} (sampled at {range_of(rates)} Hz) were"
+            f" resampled to {s.rate:g} Hz and"
             f" {_low_pass(s)}; {part} was analysed unless another window was specified."
         ),
         _welch(s),
         (
             f"Spectra of trials of one {whose} were averaged, weighted by their number of Welch"
-            " segments. Where trials scattered more than expected from these, all errors were"
-            " widened accordingly."
+            " segments; of what else was measured the trials' values were averaged."
         ),
+        _measured(study.cells[0].target),
+        *(_model(study, judged) if study.aic else []),
+        *_statistics(study),
+        f"{_software(used)}, scipy {scipy.__version__}, Python {platform.python_version()}.",
+    ]
+    return " ".join(said)
+
+
+def _model(study: "StudyResult", judged: list[bool]) -> list[str]:
+    """The model of all people, and how many it describes."""
+    noise = "" if study.options["noise"] is None else f" with {study.options['noise']} noise"
+    known = study.cells[0].target.mean_force is not None
+    further = " and its coefficient of variation"
+    if known:
+        further = ", its coefficient of variation and its mean force"
+    return [
         (
-            f"A stochastic rheological muscle model{noise} was fitted to every averaged spectrum,"
-            " its coefficient of variation and, where recorded in newtons, its mean force (linear"
-            f" response, Levenberg-Marquardt, {study.options['starts']} starts, log power weighted"
-            " by the scatter of Welch's estimate)."
+            f"A stochastic rheological muscle model{noise} was fitted to every averaged spectrum"
+            f"{further} (linear response, Levenberg-Marquardt, {study.options['starts']} starts,"
+            " log power weighted by the scatter of Welch's estimate)."
         ),
         f"All spectra were fitted with the same model ({RUNGS[study.rung]}){_choice(study)}.",
         (
-            f"The model describes {sum(judged)} of {len(judged)} spectra (p >= 0.01); the errors of"
-            " the others were widened."
+            f"The model describes {sum(judged)} of {len(judged)} spectra (p >= 0.01); the model's"
+            " numbers of the others were left out."
         ),
-        *_statistics(study),
-        f"{_software(versions())}, scipy {scipy.__version__}, Python {platform.python_version()}.",
     ]
-    return " ".join(said)
+
+
+def _measured(target: "Target") -> str:
+    """How what needs no model was measured."""
+    low, high = tremor_band(target.quantity)
+    power = "the discrete cosine transform (DCT-II) of the whole part, over the squared mean"
+    return (
+        "Mean, standard deviation and coefficient of variation (about the mean, and about a"
+        f" straight line) are those of the filtered signal. Power by band is from {power}; the"
+        " median frequency halves the power of the Welch spectrum; sample entropy has templates of"
+        f" 2 samples and a tolerance of 0.2 standard deviations. A tremor from {low:g} to {high:g}"
+        " Hz was stated where the averaged Welch spectrum had a peak that at most 1 % of simulated"
+        " smooth spectra show; its frequency is the centre of the power above the smooth spectrum,"
+        " its size the root of that power over the mean."
+    )
 
 
 def fit_methods(result: "FitResult") -> str | None:
@@ -107,6 +136,7 @@ def fit_methods(result: "FitResult") -> str | None:
     said = [
         _data(result),
         _welch(target.settings),
+        *([_measured(target)] if is_recorded(target.measured) else []),
         (
             f"A stochastic rheological muscle model ({result.only.model}) was fitted to"
             f" {' and '.join(fitted.rsplit(', ', 1))} {how} (Levenberg-Marquardt,"
@@ -225,13 +255,15 @@ def _statistics(study: "StudyResult") -> list[str]:
     correction = NAMES.get(study.options["correction"])
     p = (
         f"p-values were corrected by {correction}, for all comparisons of the same kind together"
+        + " (those of the model's numbers apart from those of measured ones)" * bool(study.aic)
         if correction
         else "p-values are not corrected for the number of comparisons"
     )
     left = [d.left_out for d in found if d.left_out]
     selected = (
         [
-            "A quantity that a person's fit does not determine was left out for that person (in"
+            "A quantity that is not known of a person (no tremor, not determined by the fit, or a"
+            f" model that does not describe the spectrum) was left out for that person (in"
             f" {len(left)} of {len(found)} comparisons, {range_of(left)} people), which is a"
             " selection."
         ]

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxmuscle._common import pages
+from jaxmuscle._common.environment import versions
 from jaxmuscle._common.pages import Html
 
 from ._ladder_text import format_p
+from ._study_text import difference_in_words, people_in_words, table_1, trials_in_words
 
 if TYPE_CHECKING:
     from jaxmuscle.fits._cohort import CohortResult
@@ -21,6 +23,7 @@ REPORT = "report.html"
 WOULD = "What the data would determine if the model held"
 # names of settings that say too little
 SPELT_OUT = {"carried": "multiplied, to come to the mean force"}
+OF_MODEL = ("rung", "noise", "starts", "key")  # options of a study
 STATE = 4  # the column of a fit's card that says whether the data determine a number
 PARAMETERS = ("name", "value", "95 % interval", "unit", "what it is")
 FIGURES = {
@@ -35,6 +38,10 @@ FIGURES = {
     "cohort": (
         "What the data of at least half of the targets determine, with standard errors. Spectra:"
         " every target (thin), the geometric mean of each group with its standard error (thick)."
+    ),
+    "quantities": (
+        "What is compared. Dots: people, with standard errors (of the scatter of their trials, or"
+        " within them). Grey: the mean of the group."
     ),
     "spectra": (
         "Spectra of all people (thin), and the geometric mean of each group with its standard error"
@@ -54,10 +61,12 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
     card = result.summary()
     rows = {
         state: [row[:STATE] + row[STATE + 1 :] for row in card.rows if row[STATE] == state]
-        for state in ("determined", "not determined", "fixed")
+        for state in ("measured", "determined", "not determined", "fixed")
     }
     body = [
         _verdict(card.heading, good=False if not result.success else result.adequate),
+        pages.heading("What is measured"),
+        pages.table(PARAMETERS[:STATE], [row[:STATE] for row in rows["measured"]]),
         pages.heading("What the data determine" if result.adequate is not False else WOULD),
         (
             pages.table(PARAMETERS, rows["determined"])
@@ -182,59 +191,54 @@ def study_report(study: "StudyResult", folder: Path) -> None:
     """Write report.html of a study."""
     import matplotlib.pyplot as plt
 
-    figure: Any = study.plot()
-    shown = pages.picture(figure, FIGURES["spectra"])
-    plt.close(figure)
-    differences = sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))
+    figures = study.figures()
+    pictures = [pages.picture(figure, FIGURES[name]) for name, figure in figures.items()]
+    for figure in figures.values():
+        plt.close(figure)
+    found = sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))
     rows = [
         (
-            d.quantity,
-            d.where,
-            f"{d.b} - {d.a}",
-            f"{d.difference:.3g}",
-            f"{d.low:.3g} to {d.high:.3g}",
-            _unit(d.unit),
+            *difference_in_words(d),
             f"{d.p:.2g}",
             "" if d.p_corrected is None else f"{d.p_corrected:.2g}",
+            " and ".join(map(str, d.members if d.kind != "conditions" else d.members[:1])),
+            str(d.left_out or ""),
         )
-        for d in differences
+        for d in found
     ]
-    columns = (
-        "quantity",
-        "condition",
-        "comparison",
-        "difference",
-        "interval",
-        "unit",
-        "p",
-        "p corrected",
-    )
+    columns = ("comparison", "difference and interval", "p", "p corrected", "people", "left out")
+    heads, lines = table_1(study)
     fits = [(name, result.verdict) for name, result in study.cohort.results.items()]
     fits += [(name, f"not fitted: {why}") for name, why in study.cohort.failed.items()]
     body = [
-        _verdict(study.cohort.verdict, good=study.success),
-        pages.items(line.strip() for line in str(study).splitlines()[:3]),
-        shown,
+        pages.items((people_in_words(study), trials_in_words(study))),
+        pages.heading("Table 1: mean ± SD of people"),
+        pages.table(("", *heads), [(words, *cells) for words, cells in lines]),
+        *pictures,
         pages.heading("What differs"),
         pages.table(columns, rows) if rows else pages.paragraph("Nothing could be compared."),
-        pages.heading("The fits"),
-        pages.table(("person and condition", "in words"), fits),
+        *(
+            [
+                pages.heading("The fits"),
+                _verdict(study.cohort.verdict, good=study.success),
+                pages.table(("person and condition", "in words"), fits),
+            ]
+            if study.aic
+            else []
+        ),
         pages.heading("For your methods section"),
         pages.paragraph(study.methods()),
         pages.heading("What to do next"),
         pages.items(
             (
-                (
-                    "Look at people whom the model does not describe, before you interpret a"
-                    " difference."
-                ),
                 "Report p corrected, and how many people were left out of each comparison.",
-                "All numbers are in people.csv and differences.csv.",
+                "All numbers are in table1.csv, people.csv and differences.csv.",
             )
         ),
         *_how(
-            study.options | {"source": study.source},
-            next(iter(study.cohort.results.values())).versions,
+            {n: v for n, v in study.options.items() if study.aic or n not in OF_MODEL}
+            | {"source": study.source},
+            versions(),
         ),
     ]
     pages.write_page(folder / REPORT, "Study", body)
@@ -332,8 +336,7 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
     place, other = shlex.quote(str(path)), shlex.quote(str(path.parent / "compare"))
     if not result.adequate:
         return [
-            "Report that the model does not describe the data, and report none of its numbers.",
-            "Mean, variation, bands and peak need no model: `jaxmuscle steadiness RECORDING`.",
+            "Report what is measured, and that the model does not describe the data.",
             "Look at the residuals: orange-red bars are where the model misses the data.",
             "See whether the recording drifts: `jaxmuscle analyse RECORDING`.",
             *(
@@ -351,9 +354,7 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
         f"What should you measure to know the rest? `jaxmuscle identifiability {place}`.",
         (
             'In a paper, give the parameters under "What the data determine" with their intervals,'
-            " unless a note says not to. Take mean, variation and bands from `jaxmuscle"
-            " steadiness`, which needs no model. If the model has a tremor, leave out"
-            " high_frequency_floor: there it holds the tremor, too."
+            " unless a note says not to, beside those that are measured."
         ),
         "Name those that the data do not determine.",
     ]

@@ -1,10 +1,15 @@
 """A study in words: the report on a terminal."""
 
+import math
 from collections import Counter
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import folded
+from jaxmuscle.data._measured import MEASURES
 from jaxmuscle.fits._differences import Difference
 from jaxmuscle.model._rungs import RUNGS
 
@@ -12,6 +17,29 @@ if TYPE_CHECKING:
     from jaxmuscle.fits._study import StudyResult
 
 MOST = 12  # comparisons on a terminal
+TREMOR = "tremor_frequency"
+LABEL, COLUMN, ACROSS, LONGEST = 32, 16, 3, 14  # letters, and columns beside each other
+PERCENT, MILLIONTHS = (100.0, " %"), (1e6, " 1e-6 mean²")
+# Table 1 on a terminal: words and what the numbers are multiplied with
+SHOWN = {
+    "mean": ("mean [unit]", 1.0),
+    "standard_deviation": ("standard deviation [unit]", 1.0),
+    "coefficient_of_variation": ("coefficient of variation [%]", 100.0),
+    "coefficient_of_variation_without_drift": ("  without a drift [%]", 100.0),
+    "relative_power_4_8": ("power 4-8 Hz [1e-6 mean²]", 1e6),
+    "relative_power_8_12": ("power 8-12 Hz [1e-6 mean²]", 1e6),
+    "median_frequency": ("median frequency [Hz]", 1.0),
+    "sample_entropy": ("sample entropy", 1.0),
+    "tremor_frequency": ("tremor frequency [Hz]", 1.0),
+    "tremor_size": ("tremor size [% of the mean]", 100.0),
+}
+SCALES = {
+    "coefficient_of_variation": PERCENT,
+    "coefficient_of_variation_without_drift": PERCENT,
+    "relative_power_4_8": MILLIONTHS,
+    "relative_power_8_12": MILLIONTHS,
+    "tremor_size": PERCENT,
+}
 
 
 def study_card(study: "StudyResult") -> Card:
@@ -20,49 +48,101 @@ def study_card(study: "StudyResult") -> Card:
 
 
 def _lines(study: "StudyResult") -> list[str]:
-    cohort, found = study.cohort, sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))
+    lines = [f"Study: {people_in_words(study)}", f"  {trials_in_words(study)}"]
+    columns, rows = table_1(study)
+    lines.append("Table 1: mean ± SD of people; in brackets of how many, where some have no value")
+    for start in range(0, len(columns), ACROSS):
+        block = slice(start, start + ACROSS)
+        heads = "".join(f"{head[:LONGEST]:>{COLUMN}}" for head in columns[block])
+        lines.append(f"{'':<{LABEL}}{heads}".rstrip())
+        for words, cells in rows:
+            said = "".join(f"{cell:>{COLUMN}}" for cell in cells[block])
+            lines.append(f"{f'  {words}':<{LABEL}}{said}".rstrip())
     alpha = study.options["alpha"]
-    clear = [d for d in found if d.p_corrected is not None and d.p_corrected < alpha]
-    model = f"model of all: {study.rung}, {RUNGS[study.rung]}{_aic(study)}"
-    lines = [
-        f"Study: {people_in_words(study)}",
-        f"  {trials_in_words(study)}",
-        f"  {model}",
-        f"  {cohort.verdict}",
-    ]
-    lines += [f"  not fitted: {name}: {why}" for name, why in cohort.failed.items()]
-    if not found:
-        return [
-            *lines,
-            (
-                "  nothing to compare: no quantity is determined for two people on each side of a"
-                " comparison"
-            ),
+    found = sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))
+    measured = [d for d in found if d.quantity in MEASURES]
+    of_model = [d for d in found if d.quantity not in MEASURES]
+    lines += _told(measured, "what is measured", study)
+    if study.aic:
+        lines += [
+            f"Model of all people: {RUNGS[study.rung]} (rung {study.rung}){_aic(study)}",
+            f"  {study.cohort.verdict}",
+            *(f"  not fitted: {name}: {why}" for name, why in study.cohort.failed.items()),
+            *_told(of_model, "the model's numbers", study),
         ]
-    families = Counter(d.kind for d in found)
-    lines.append(
-        f"  comparisons: {', '.join(f'{n} of {kind}' for kind, n in families.items())}; "
-        f"after correction ({study.options['correction']}) {len(clear)} have p < {alpha:g}"
-    )
-    lines += [f"    {_sentence(d, alpha)}" for d in found[:MOST]]
-    lines += [f"    and {len(found) - MOST} more"] if len(found) > MOST else []
     if any(d.left_out for d in found):
         lines.append(
-            "  People whose fits do not determine a quantity are left out of its comparisons. This"
-            " is a selection and can mislead"
+            "People without a value are left out: of a tremor those who show none, of the model's"
+            " numbers those whom it does not describe or whose data do not determine it. This is a"
+            " selection and can mislead"
         )
+    if any(d.p_corrected is not None and d.p_corrected < alpha for d in found):
+        lines.append(f"* p < {alpha:g} after correction")
     return lines
 
 
+def _told(found: list[Difference], what: str, study: "StudyResult") -> list[str]:
+    if not found:
+        return [f"Comparisons of {what}: none, nothing is known of two people on each side"]
+    alpha, correction = study.options["alpha"], study.options["correction"]
+    clear = sum(d.p_corrected is not None and d.p_corrected < alpha for d in found)
+    kinds = ", ".join(f"{n} of {kind}" for kind, n in Counter(d.kind for d in found).items())
+    more = len(found) - MOST
+    return [
+        f"Comparisons of {what}: {kinds}; after correction ({correction}) {clear} have"
+        f" p < {alpha:g}",
+        *(f"  {_sentence(d, alpha)}" for d in found[:MOST]),
+        *([f"  and {more} more: differences(), differences.csv"] if more > 0 else []),
+    ]
+
+
+def table_1(study: "StudyResult") -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Mean ± SD of people: the names of groups and conditions, and of every quantity that a paper
+    states its words and a cell for each of them."""
+    found = {(r["group"], r["condition"], r["quantity"]): r for r in study.table_1()}
+    columns = list(dict.fromkeys((group, condition) for group, condition, _ in found))
+    lines = []
+    for name, (words, scale) in SHOWN.items():
+        rows = [found[(*column, name)] for column in columns if (*column, name) in found]
+        if len(rows) == len(columns):
+            digits = _digits([scale * row["sd"] for row in rows])
+            unit = words.replace("[unit]", f"[{rows[0]['unit']}]")
+            lines.append((unit, [_mean_in_words(row, scale, digits) for row in rows]))
+        if name == TREMOR and rows:
+            lines.append(("tremor seen in", [f"{row['n']} of {row['people']}" for row in rows]))
+    return [", ".join(filter(None, column)) or "all" for column in columns], lines
+
+
+def _digits(spreads: list[float]) -> int:
+    """Places behind the point, the same in a row: two digits of the SD in its middle."""
+    known = [sd for sd in spreads if sd > 0]
+    return max(0, 1 - math.floor(math.log10(np.median(known)))) if known else 3
+
+
+def _mean_in_words(row: Mapping[str, Any], scale: float, digits: int) -> str:
+    if not row["n"]:
+        return "none"
+    mean, sd = scale * row["mean"], scale * row["sd"]
+    said = f"{mean:.{digits}f}" + ("" if math.isnan(sd) else f" ± {sd:.{digits}f}")
+    return said + (f" ({row['n']})" if row["n"] < row["people"] else "")
+
+
+def difference_in_words(d: Difference) -> tuple[str, str]:
+    """What is compared with what; the difference with its interval and unit."""
+    scale, unit = SCALES.get(d.quantity, (1.0, "" if d.unit == "1" else f" {d.unit}"))
+    where = f", {d.where}" if d.kind == "groups" and d.where else ""
+    of = f", change {d.where}" if d.kind == "interaction" else where
+    middle, low, high = (f"{scale * x:.3g}" for x in (d.difference, d.low, d.high))
+    return f"{d.quantity}{of}: {d.b} - {d.a}", f"{middle} ({low} to {high}){unit}"
+
+
 def _sentence(d: Difference, alpha: float) -> str:
-    unit = "" if d.unit == "1" else f" {d.unit}"
-    where = f", {d.where}" if d.where else ""
     people = " and ".join(map(str, d.members if d.kind != "conditions" else d.members[:1]))
     left = f", {d.left_out} left out" if d.left_out else ""
+    said, number = difference_in_words(d)
     return (
-        f"{'*' if d.p_corrected is not None and d.p_corrected < alpha else ' '}"
-        f" {d.quantity}{where}: {d.b} - {d.a} = {d.difference:.3g}{unit} ({d.low:.3g} to"
-        f" {d.high:.3g}), p = {d.p:.2g}, corrected {d.p_corrected:.2g} ({people} people{left})"
+        f"{'*' if d.p_corrected is not None and d.p_corrected < alpha else ' '} {said} = {number},"
+        f" p = {d.p:.2g}, corrected {d.p_corrected:.2g} ({people} people{left})"
     )
 
 

@@ -20,7 +20,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from ._scaling import at_force
 
 FORMAT = 2  # of a preset; 1 may leave out what a task does not have
-FIT_FORMATS = (2, 3, 4)  # of a fit.json; 2 may
+FIT_FORMAT = 5  # of a fit.json
 
 
 def load_preset(name_or_path: str | Path) -> AbstractTask:
@@ -99,14 +99,13 @@ def _checked(text: str, file: str, kind: str) -> PresetFile | _InFit:
     if not isinstance(table.get("task_table"), dict):
         several = " It is the fit of several targets: give that of one." if "parts" in table else ""
         raise PresetError(f"{file}: has no [task_table]: is it a preset or a fit.json?{several}")
-    if kind == "JSON" and "success" in table:  # a fit.json since format 3 leaves nothing out
+    if kind == "JSON" and "success" in table:  # a fit.json leaves nothing out
         formats = table.get("format")
-        if type(formats) is not int or formats not in FIT_FORMATS:
+        if type(formats) is not int or formats != FIT_FORMAT:
             raise PresetError(
-                f"{file}: format = {formats!r}: is not a fit.json of format"
-                f" {' or '.join(map(str, FIT_FORMATS))}"
+                f"{file}: format = {formats!r}: is not a fit.json of format {FIT_FORMAT}"
             )
-        return _InFit(formats - 1, table["task_table"])
+        return _InFit(FORMAT, table["task_table"])
     return checked(table, PresetFile, file, PresetError)
 
 

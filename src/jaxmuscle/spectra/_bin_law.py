@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.special import digamma, polygamma, stdtrit
+from scipy.special import digamma, gammaincinv, ndtr, polygamma, stdtrit
 
 from jaxmuscle._common.arrays import is_concrete
 
@@ -60,6 +60,16 @@ def _welch_law(
             covariance += trials * count * (1 - abs(j) / count) / sum(segments) ** 2 * both
     sd = np.sqrt(np.diag(covariance))
     return BinLaw(2 * power**2 / sd**2, covariance / np.outer(sd, sd))
+
+
+def draw_powers(
+    law: BinLaw, count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "count bins"]:
+    """Random powers about 1 of that law: chi-squared, normal scores with the correlation of the
+    bins."""
+    half = law.degrees / 2
+    scores = rng.standard_normal((count, len(half))) @ np.linalg.cholesky(law.correlation).T
+    return gammaincinv(half, ndtr(scores)) / half
 
 
 def target_law(target: Any) -> BinLaw:

@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-from ._bin_law import welch_law
+from ._bin_law import draw_powers, welch_law
 from ._settings import SpectrumSettings, require
 
 DEGREE = 3  # of the polynomial in ln f that a smooth spectrum is, in the logarithm
@@ -73,6 +73,18 @@ def bins_around(band: tuple[float, float], settings: SpectrumSettings) -> tuple[
     top = min(1.8 * band[1], cut, 0.45 * settings.rate)
     first = max(1, int(np.ceil(0.5 * band[0] / settings.resolution)))
     return first, int(top / settings.resolution)
+
+
+def bins_in(band: tuple[float, float], settings: SpectrumSettings) -> Int[np.ndarray, " bins"]:
+    """The bins of the settings about a band, by their numbers; none where they are too few for the
+    test."""
+    first, last = bins_around(band, settings)
+    bins = np.arange(max(first, settings.first_bin), min(last, settings.last_bin) + 1)
+    # The polynomial, a bell, and as many bins again for the scatter.
+    enough = len(bins) >= 2 * (DEGREE + 2) and bins[-1] * settings.resolution >= (
+        band[0] + settings.resolution
+    )
+    return bins if enough and 0 < band[0] < band[1] else bins[:0]
 
 
 def find_peaks(
@@ -149,13 +161,10 @@ def measure_peak(
 def _build_family(
     settings: SpectrumSettings, segments: tuple[int, ...], band: tuple[float, float]
 ) -> _Family:
-    first, last = bins_around(band, settings)
-    bins = np.arange(max(first, settings.first_bin), min(last, settings.last_bin) + 1)
-    frequency = bins * settings.resolution
-    # The polynomial, a bell, and as many bins again for the scatter.
-    enough = len(bins) >= 2 * (DEGREE + 2) and frequency[-1] >= band[0] + settings.resolution
+    bins = bins_in(band, settings)
     remedy = f"the bins reach from {settings.frequency[0]:.3g} to {settings.frequency[-1]:.3g} Hz"
-    require(bool(enough and 0 < band[0] < band[1]), "band", band, remedy)
+    require(len(bins) > 0, "band", band, remedy)
+    frequency = bins * settings.resolution
     law = welch_law(settings, bins, segments)
     half = law.degrees / 2
     sd = np.sqrt(scipy.special.polygamma(1, half))
@@ -168,10 +177,7 @@ def _build_family(
     bells = np.exp(-4 * np.log(2) * ((frequency[:, None] - centre) / width) ** 2)
     bias = scipy.special.digamma(half) - np.log(half)
     family = _Family(frequency, bins, whiten, bias, smooth, bells, centre, width, np.empty(0))
-    # Powers of chi-squared law, whose normal scores have the correlation of the bins.
-    scores = np.random.default_rng(0).standard_normal((DRAWS, len(bins)))
-    scores = scores @ np.linalg.cholesky(law.correlation).T
-    drawn = scipy.special.gammaincinv(half, scipy.special.ndtr(scores)) / half
+    drawn = draw_powers(law, DRAWS, np.random.default_rng(0))
     statistic, _, _ = _find_clearest(family, smooth, np.log(drawn) - bias)
     return family._replace(null=np.sort(statistic))
 

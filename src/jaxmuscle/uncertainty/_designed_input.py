@@ -14,7 +14,7 @@ from jaxmuscle._common.files import replacing, write_json
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._perturbed import MARGIN
 from jaxmuscle.model._parameters import PARAMETERS
-from jaxmuscle.objective._derived import TANGENTS
+from jaxmuscle.objective._derived import MEAN, TANGENTS
 
 from ._identifiability_report import BASE
 from ._lengthening import Lengthening
@@ -447,7 +447,7 @@ class DesignedInput(Printed, Result, eqx.Module):
 
     def _as_fitted(self) -> list[str]:
         """What the design takes from the fit, and what to do if that is doubtful."""
-        mean = [self.values[name] for name in self.values if name.partition("@")[0] == "mean"]
+        mean = [self.values[name] for name in self.values if name.partition("@")[0] == MEAN]
         lines = [
             "  assumed: the muscle is the one given here"
             + f", with a mean force of {mean[0]:.3g} N" * bool(mean)

@@ -19,7 +19,7 @@ from jaxmuscle.objective._arguments import MASSES
 from jaxmuscle.objective._consequences import Expansion, quantities
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products
-from jaxmuscle.objective._derived import unit_of
+from jaxmuscle.objective._derived import MEAN, unit_of
 from jaxmuscle.objective._problem import FitProblem
 
 from ._design_information import (
@@ -116,7 +116,7 @@ def identifiability(
         notices += (NO_NOISE,)
     if target is None:
         notices = missed(result) + notices
-    mean_force = result.derived["mean"].value if result.per_newton else None
+    mean_force = result.derived[MEAN].value if result.per_newton else None
     # Of another target the fit has said nothing.
     found = {} if target is not None else result.found
     known = {n for n, k in present.quantities.items() if k.determined}

@@ -1,6 +1,7 @@
 """The identifiability report: what is known now, what it would be with further measurements, in
 words and tables."""
 
+import re
 import textwrap
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,8 +16,9 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
-from jaxmuscle.fits._part import ALIASES, RELATIVE, as_people_say
-from jaxmuscle.objective._covariance import DETERMINED
+from jaxmuscle.fits._part import ALIASES, RELATIVE, in_use
+from jaxmuscle.objective._covariance import DETERMINED, spelt
+from jaxmuscle.objective._derived import MEAN
 
 if TYPE_CHECKING:
     import pandas
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-COLUMNS = 4
+COLUMNS, CELL = 4, 6  # designs beside each other, letters
 PAIRS_TOLD = 3
 TOGETHER = " together with "
 SAME = 1e-6
@@ -305,9 +307,15 @@ def _present(report: IdentifiabilityReport) -> list[str]:
     return lines
 
 
+def _as_people_say(product: str) -> str:
+    """A product of parameters by the names of the table above it."""
+    return re.sub(r"\w+", lambda word: in_use(word[0]) or word[0], spelt(product))
+
+
 def _products(outlook: Outlook) -> str:
     return ", ".join(
-        f"{as_people_say(name)} (± {100 * error:.2g} %)" for name, error in outlook.products.items()
+        f"{_as_people_say(name)} (± {100 * error:.2g} %)"
+        for name, error in outlook.products.items()
     )
 
 
@@ -392,8 +400,10 @@ def _table(report: IdentifiabilityReport) -> list[str]:
         known = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
         opened = OPENED * any(FITTED_TOO in outlook.data for outlook in report.designs)
         lines += _wrapped(f"taken as known, as in the fit: {known}{opened}", 4, "  ")
-    for start in range(0, max(len(possible), 1), COLUMNS):
-        block = possible[start : start + COLUMNS]
+    # two more stand before them
+    across = min(COLUMNS, (WIDTH - wide - 17) // CELL - 2)
+    for start in range(0, max(len(possible), 1), across):
+        block = possible[start : start + across]
         heads = ["prior", "now", *(label for label, _ in block)]
         lines.append(
             f"  {'':<{wide}}{'value':>9} {'unit':<5}" + "".join(f"{head:>6}" for head in heads)
@@ -406,7 +416,7 @@ def _table(report: IdentifiabilityReport) -> list[str]:
                 here,
                 *(_shown(d.quantities[name]) for _, d in block),
             ]
-            value, unit = _stated(now, None if name == "mean" else report.mean_force)
+            value, unit = _stated(now, None if name == MEAN else report.mean_force)
             lines.append(
                 f"  {name:<{wide}}{value:>9.3g} {unit:<5}" + "".join(f"{cell:>6}" for cell in cells)
             )

@@ -1,0 +1,334 @@
+"""What is measured of held signals and of spectra, without any model: variability, power by band,
+tremor, regularity."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from jaxmuscle._common.text import squared
+from jaxmuscle.spectra._bin_law import ENOUGH, bin_statistics
+from jaxmuscle.spectra._fluctuations import BANDS, dfa, in_bands, variance_spectrum
+from jaxmuscle.spectra._measures import regularity
+from jaxmuscle.spectra._peak_test import bins_around, bins_in, find_peaks, measure_peak
+from jaxmuscle.spectra._settings import SpectrumSettings
+
+from ._measure import Measure, log_interval, logit_interval, student_interval
+
+AS_RECORDED: dict[str, Any] = {"filter_direction": "both", "sampling": "filtered"}
+RECORDED = SpectrumSettings(**AS_RECORDED)
+PARTS, SLOWEST = 4, 4  # parts of a recording; ordinates that say how sure its mean is
+# Hz, where a tremor is looked for; what moves shows it over a wider band than a held force
+TREMOR_BANDS = {"displacement": (3.0, 20.0), "acceleration": (3.0, 20.0)}
+TREMOR_BAND = (6.0, 12.0)
+LEVEL = 0.01  # of the test for a tremor
+RANGES = {name.removeprefix("band"): edges for name, edges in BANDS.items()} | {
+    "_above_12": (12.0, math.inf)
+}
+FAST = 0.5  # Hz
+DRAWN = 200  # spectra, for errors where only the spectrum is known
+SIGNED = ("mean", "dfa_exponent")  # all else is 0 or more
+MEAN, VARIATION, MEDIAN = "mean", "coefficient_of_variation", "median_frequency"
+REGULARITY = ("approximate_entropy", "sample_entropy", "dfa_exponent")
+Measures = dict[str, Measure]
+# names of all that is measured of recordings
+MEASURES = (
+    MEAN,
+    "standard_deviation",
+    VARIATION,
+    f"{VARIATION}_without_drift",
+    f"{VARIATION}_above_{FAST:g}",
+    *(f"{kind}{name}" for kind in ("power", "relative_power", "share") for name in RANGES),
+    MEDIAN,
+    *REGULARITY,
+    "tremor_p",
+    "tremor_frequency",
+    "tremor_size",
+    "tremor_detectable",
+)
+
+
+def tremor_band(quantity: str | None) -> tuple[float, float]:
+    """The band [Hz] in which a tremor is looked for in a recording of this quantity."""
+    return TREMOR_BANDS.get(quantity or "", TREMOR_BAND)
+
+
+def is_recorded(measures: Measures) -> bool:
+    """Whether they are of recordings, and not of a spectrum alone."""
+    return "standard_deviation" in measures
+
+
+def measure_signals(
+    signals: Sequence[Float[np.ndarray, " _"]], unit: str, band: tuple[float, float]
+) -> tuple[list[Measures], Measures]:
+    """The measures that `steadiness` lists, of each of several signals and of all together.
+
+    The signals are those of one person in one condition, sampled and low-passed as `RECORDED` says.
+    """
+    settings = _settings_for_band(band)
+    segments = [_segments(x, settings) for x in signals]
+    own = [_own(x, unit) for x in signals]
+    each = [
+        _stated(m | _measure_tremor([s], settings, band, m), 1, len(s))
+        for m, s in zip(own, segments, strict=True)
+    ]
+    together = {name: _together([m[name] for m in own]) for name in own[0]}
+    together |= _measure_tremor(segments, settings, band, together)
+    return each, _stated(together, len(signals), sum(map(len, segments)))
+
+
+def _own(x: Float[np.ndarray, " times"], unit: str) -> Measures:
+    """The measures of one signal but the tremor."""
+    rate = float(RECORDED.rate)
+    f, power = variance_spectrum(x, rate)
+    _, level = variance_spectrum(scipy.signal.detrend(x), rate)
+    mean, variance = float(np.mean(x)), float(np.sum(power))
+    sure = float(np.sqrt(np.mean(power[:SLOWEST])))
+    found = {
+        MEAN: _measure(mean, sure, unit),
+        "standard_deviation": _measure(
+            math.sqrt(variance), _error(power) / (2 * math.sqrt(variance)), unit
+        ),
+        VARIATION: _variation(power, mean, sure),
+        f"{VARIATION}_without_drift": _variation(level, mean, sure),
+        f"{VARIATION}_above_{FAST:g}": _variation(power[f >= FAST], mean, sure),
+    }
+    varies, square = math.isfinite(found[VARIATION].value), mean**2
+    relative, shares = {}, {}
+    for name, (low, high) in RANGES.items():
+        inside = (f >= low) & (f < high)
+        share = float(np.sum(power[inside])) / variance
+        within, error = share * variance, _error(power * inside)
+        found[f"power{name}"] = _measure(within, error, squared(unit))
+        relative[f"relative_power{name}"] = (
+            _measure(within / square, math.hypot(error, 2 * within * sure / mean) / square, "1")
+            if varies
+            else _measure(math.nan, math.nan, "1")
+        )
+        shares[f"share{name}"] = _measure(share, _error(power * (inside - share)) / variance, "1")
+    regular = {}
+    whole, *parts = [(*regularity(part), dfa(part)) for part in (x, *np.array_split(x, PARTS))]
+    for name, value, each in zip(REGULARITY, whole, zip(*parts, strict=True), strict=True):
+        error = (
+            float(np.std(each, ddof=1)) / math.sqrt(PARTS)
+            if np.all(np.isfinite(each))
+            else math.nan
+        )
+        regular[name] = _measure(value, error, "1", "parts")
+    return found | relative | shares | _median(_segments(x, RECORDED)) | regular
+
+
+def _median(segments: Float[np.ndarray, "segments bins"]) -> Measures:
+    """The median frequency of the mean of segments, its error by leaving out one after another."""
+    count = len(segments)
+    left_out = (np.sum(segments, axis=0) - segments) / max(count - 1, 1)
+    error = math.sqrt((count - 1) * np.var([median_frequency(p, RECORDED) for p in left_out]))
+    value = median_frequency(np.mean(segments, axis=0), RECORDED)
+    return {MEDIAN: _measure(value, error if count > 1 else math.nan, "Hz", "segments")}
+
+
+def median_frequency(power: Float[np.ndarray, " bins"], settings: SpectrumSettings) -> float:
+    """Below which half of the power in the bins lies [Hz], if it is even within each bin."""
+    edges = np.append(settings.frequency, settings.frequency[-1] + settings.resolution)
+    below = np.append(0.0, np.cumsum(power))
+    return float(np.interp(0.5 * below[-1], below, edges - 0.5 * settings.resolution))
+
+
+def _measure(value: float, error: float, unit: str, error_from: str = "spectrum") -> Measure:
+    known = math.isfinite(value) and math.isfinite(error)
+    return Measure(float(value), float(error) if known else None, unit, error_from)
+
+
+def _error(power: Float[np.ndarray, " frequencies"]) -> float:
+    """Standard error of a sum: an ordinate is s χ²(1), its variance 2 s², and the mean of its
+    square 3 s²."""
+    return math.sqrt(2 / 3 * float(np.sum(power**2)))
+
+
+def _variation(power: Float[np.ndarray, " frequencies"], mean: float, sure: float) -> Measure:
+    deviation = math.sqrt(float(np.sum(power)))
+    if not deviation <= abs(mean):
+        return _measure(math.nan, math.nan, "1")
+    error = math.hypot(_error(power) / (2 * deviation * mean), deviation * sure / mean**2)
+    return _measure(deviation / abs(mean), error, "1")
+
+
+def _stated(measures: Measures, trials: int, segments: int) -> Measures:
+    """The measures with their 95 % intervals."""
+    degrees = {
+        "trials": trials - 1,
+        "spectrum": SLOWEST * trials,
+        "parts": (PARTS - 1) * trials,
+        "segments": segments - 1,
+        "bins": 0,  # has no Student's t
+    }
+    return {
+        name: Measure(
+            m.value, m.stderr, m.unit, m.error_from, _interval(name, m, degrees[m.error_from])
+        )
+        for name, m in measures.items()
+    }
+
+
+def _interval(name: str, m: Measure, degrees: int) -> tuple[float, float] | None:
+    """Student's t, cut where no value can lie; but of what the spectrum says besides the mean in
+    the logarithm or logit."""
+    if m.stderr is None:
+        return None
+    share = name.startswith("share")
+    if m.error_from in ("spectrum", "bins") and name != MEAN:
+        return (logit_interval if share else log_interval)(m.value, m.stderr)
+    low, high = student_interval(m.value, m.stderr, degrees)
+    return low if name in SIGNED else max(low, 0.0), min(high, 1.0) if share else high
+
+
+def _together(each: list[Measure]) -> Measure:
+    """The mean over the trials; its error from their scatter, or of few trials from their own
+    errors."""
+    values, first, count = [m.value for m in each], each[0], len(each)
+    if not np.all(np.isfinite(values)):
+        return _measure(math.nan, math.nan, first.unit, first.error_from)
+    if count >= ENOUGH:
+        error = float(np.std(values, ddof=1)) / math.sqrt(count)
+        return _measure(float(np.mean(values)), error, first.unit, "trials")
+    error = math.hypot(*(math.nan if m.stderr is None else m.stderr for m in each)) / count
+    return _measure(float(np.mean(values)), error, first.unit, first.error_from)
+
+
+def _settings_for_band(band: tuple[float, float]) -> SpectrumSettings:
+    """Those of recordings, with the bins that say what is smooth about a band."""
+    first, last = bins_around(band, RECORDED)
+    return SpectrumSettings(**AS_RECORDED, first_bin=first, last_bin=last)
+
+
+def _segments(
+    x: Float[np.ndarray, " times"], settings: SpectrumSettings
+) -> Float[np.ndarray, "segments bins"]:
+    """The spectrum of every Welch segment."""
+    length, bins = settings.length, slice(settings.first_bin, settings.last_bin + 1)
+    _, _, power = scipy.signal.spectrogram(x, settings.rate, "hann", length, length - settings.step)
+    return power.T[:, bins]
+
+
+def _measure_tremor(
+    segments: list[Float[np.ndarray, "_ bins"]],  # of each trial
+    settings: SpectrumSettings,
+    band: tuple[float, float],
+    measures: Measures,
+) -> Measures:
+    """The clearest peak of the mean of all segments; its errors by leaving out one trial after
+    another, or of few trials one segment."""
+    counts, whole = tuple(map(len, segments)), np.concatenate(segments)
+    many = len(segments) >= ENOUGH
+    groups, error_from = (segments, "trials") if many else ([*whole[:, None]], "segments")
+    mean, varies = measures[MEAN], math.isfinite(measures[VARIATION].value)
+    scale, unit = (1 / abs(mean.value), "1") if varies else (1.0, mean.unit)
+
+    def measured(power: Float[np.ndarray, " bins"]) -> tuple[float, float]:
+        frequency, excess = measure_peak(power, settings, counts, band)
+        return frequency, scale * math.sqrt(excess)
+
+    found = find_peaks(np.mean(whole, axis=0), settings, counts, band, LEVEL)
+    values, errors = (math.nan, math.nan), (math.nan, math.nan)
+    if found.peaks:
+        peak = found.peaks[0]
+        values = peak.frequency, scale * math.sqrt(peak.power)
+        left_out = [
+            measured(np.mean(np.concatenate(groups[:i] + groups[i + 1 :]), axis=0))
+            for i in range(len(groups))
+        ]
+        errors = np.sqrt((len(groups) - 1) * np.var(left_out, axis=0))
+    return {
+        "tremor_p": Measure(found.p, None, "1", error_from),
+        "tremor_frequency": _measure(values[0], float(errors[0]), "Hz", error_from),
+        "tremor_size": _measure(values[1], float(errors[1]), unit, error_from),
+        "tremor_detectable": Measure(scale * math.sqrt(found.detectable), None, unit, error_from),
+    }
+
+
+def measure_spectrum(target: Any) -> Measures:
+    """What a target without recordings tells: mean and coefficient of variation as it states them;
+    of its bins shares by band, median frequency and tremor.
+
+    A share is of the power in the bins, of bins at the edges the part that lies inside; bands of
+    which the bins cover less than half are left out. Errors follow from the law of the bins: that
+    of a share s = Σ a_k p_k is √(g' C g), g_k = p_k (a_k - s), with C the covariance of the log
+    powers; those of the median and of the tremor from spectra that are drawn about the bins, normal
+    in the logarithm with that covariance. The tremor is looked for in what the bins cover of its
+    band, where all bins are there and their segments are known. Its size is √(share of the peak)
+    times the coefficient of variation.
+    """
+    found = _from_file(target)
+    if not len(target.bins):
+        return _stated(found, len(target.mean or ()), 0)
+    p, settings, f = target.proportional_power, target.settings, target.frequency
+    statistics = bin_statistics(target)
+    covariance = statistics.covariance if statistics.known else np.full(2 * (len(p),), np.nan)
+
+    def share_of(inside: Float[np.ndarray, " bins"]) -> tuple[float, float]:
+        share = float(inside @ p)
+        slope = p * (inside - share)
+        return share, math.sqrt(slope @ covariance @ slope)
+
+    covers = in_bands(f, settings.resolution)
+    for name, (low, high), inside in zip(BANDS, BANDS.values(), covers, strict=True):
+        if np.sum(inside) * settings.resolution >= 0.5 * (high - low):
+            found[f"share{name.removeprefix('band')}"] = _measure(*share_of(inside), "1", "bins")
+    if len(p) < len(settings.frequency):  # some bins are missing
+        return _stated(found, len(target.mean or ()), 0)
+    rows = np.random.default_rng(0).standard_normal((DRAWN, len(p)))
+    drawn = p * np.exp(rows @ _root(covariance).T)
+    error = np.std([median_frequency(row, settings) for row in drawn])
+    found[MEDIAN] = _measure(median_frequency(p, settings), float(error), "Hz", "bins")
+    band = tremor_band(target.quantity)
+    if target.segments is not None and len(bins_in(band, settings)):
+        found |= _tremor_of_bins(target, band, drawn)
+    return _stated(found, len(target.mean or ()), 0)
+
+
+def _from_file(target: Any) -> Measures:
+    """Mean and coefficient of variation as a target states them, with the scatter of its trials."""
+    stated = {
+        MEAN: (target.mean, target.unit or "a.u."),
+        VARIATION: (target.coefficient_of_variation, "1"),
+    }
+    found = {}
+    for name, (values, unit) in stated.items():
+        if values is not None:
+            many = len(values) >= ENOUGH
+            error = float(np.std(values, ddof=1)) / math.sqrt(len(values)) if many else math.nan
+            found[name] = _measure(float(np.mean(values)), error, unit, "trials")
+    return found
+
+
+def _root(covariance: Float[np.ndarray, "bins bins"]) -> Float[np.ndarray, "bins bins"]:
+    known = np.all(np.isfinite(covariance))
+    return np.linalg.cholesky(covariance) if known else covariance
+
+
+def _tremor_of_bins(
+    target: Any, band: tuple[float, float], drawn: Float[np.ndarray, "spectra bins"]
+) -> Measures:
+    """The clearest peak of the bins; its errors from spectra that are drawn about them."""
+    p, about = target.proportional_power, (target.settings, target.segments or (), band)
+    varied = target.coefficient_of_variation
+    scale = math.nan if varied is None else float(np.mean(varied))
+
+    def size_of(power: float) -> float:
+        return scale * math.sqrt(power / target.settings.resolution)
+
+    tested = find_peaks(p, *about, LEVEL)
+    values, errors = (math.nan, math.nan), (math.nan, math.nan)
+    if tested.peaks:
+        values = tested.peaks[0].frequency, size_of(tested.peaks[0].power)
+        each = [measure_peak(power / np.sum(power), *about) for power in drawn]
+        errors = np.std([(f, size_of(power)) for f, power in each], axis=0)
+    return {
+        "tremor_p": Measure(tested.p, None, "1", "bins"),
+        "tremor_frequency": _measure(values[0], float(errors[0]), "Hz", "bins"),
+        "tremor_size": _measure(values[1], float(errors[1]), "1", "bins"),
+        "tremor_detectable": Measure(size_of(tested.detectable), None, "1", "bins"),
+    }
