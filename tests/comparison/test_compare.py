@@ -136,7 +136,7 @@ def test_a_tremor_is_told_from_a_line():
     assert [row.adequate for row in found.rows] == [False, False, True]
     assert found.tasks["resonance", False]["resonance_amplitude"] == pytest.approx(0.1, rel=0.2)
     assert (
-        "the data prefer tremor to band-limited" in found.verdict[0]
+        "the data prefer resonance to band-limited" in found.verdict[0]
         and found.harmonic.b == "no harmonic"
     )
 

@@ -327,3 +327,9 @@ def test_text_fits_a_terminal():
     )
     for name in jm.list_targets():
         assert max(map(len, str(jm.load_target(name)).splitlines())) <= 80
+
+
+def test_of_a_fit_that_failed_no_number_of_the_model_is_printed():
+    text = str(failed_result())
+    assert "not fitted" in text.lower()
+    assert "parameters" not in text and "of the model" not in text and "one of many" not in text

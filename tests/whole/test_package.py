@@ -187,7 +187,7 @@ def test_the_installed_command_fits_a_bundled_target(installed):
     assert max(map(len, printed.splitlines())) <= 80
     assert TARGET in printed and "Written: out/fit.json" in printed
     result = jm.load_result(installed / "out" / "fit.json")
-    assert result.success and result.target == jm.load_target(TARGET)
+    assert result.success and result.target == jm.load_target(TARGET).with_measures()
     assert result.chi2_per_bin is not None and result.chi2_per_bin <= 1.3
     table = np.genfromtxt(installed / "out" / "spectrum.csv", delimiter=",", names=True)
     np.testing.assert_allclose(table["target"], result.target.proportional_power, rtol=1e-5)

@@ -275,6 +275,8 @@ def fit(
             from .cohort import fit_together
 
             unused(reading, "axis", window=window, what="recordings; these are spectra")
+            if everything:
+                raise ValueError("--all: of several spectra all numbers are in cohort.csv")
             if method != MethodName.linear or seeds is not None or increments is not None or quick:
                 raise ValueError(
                     "several spectra are fitted in one go, without simulation: leave out "

@@ -21,7 +21,8 @@ class Measure(Shown, eqx.Module):
     pure numbers).
 
     `error_from` says what the error stands on: "trials", the scatter between three or more trials;
-    or, of fewer trials, what is within them: "spectrum", "parts" or "segments", see `steadiness`.
+    or, of fewer trials, what is within them: "spectrum", "parts" or "segments", see `steadiness`;
+    "bins", where only a spectrum is known.
     `interval` has the ends of the 95 % interval, in `unit`, `None` where there is no error. A value
     that does not exist is NaN.
     """

@@ -121,9 +121,9 @@ def _of_errors(count: int) -> str:
     if count < ENOUGH:
         return (
             f"± is the standard error. It is estimated within {'the' if count == 1 else 'each'}"
-            " recording: for entropies and DFA from its four parts, for the tremor from its Welch"
-            " segments, for all else from its spectrum. So it does not say how the next recording"
-            " differs: between trials of one person we saw about twice as much."
+            " recording: for entropies and DFA from its four parts, for tremor and median frequency"
+            " from its Welch segments, for all else from its spectrum. So it does not say how the"
+            " next recording differs: between trials of one person we saw about twice as much."
         )
     return f"± is the standard error, from the scatter between the {count} trials."
 

@@ -121,7 +121,7 @@ class FitResult(Result, eqx.Module):
 
         Raises `ValueError` for an unknown name.
         """
-        known = self.measured | self.parameters | self.derived
+        known = self.parameters | self.derived | self.measured
         if name not in known:
             raise ValueError(
                 f"unknown quantity {name!r} of the fit of {self.title}: {choices(name, known)}"

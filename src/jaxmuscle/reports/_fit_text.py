@@ -8,7 +8,7 @@ import numpy as np
 from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._measured import is_recorded, tremor_band
-from jaxmuscle.data._measured_text import measured_line, tremor_lines
+from jaxmuscle.data._measured_text import TREMOR, measured_line, tremor_lines
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._part import RELATIVE, Estimate, FittedPart, once
 from jaxmuscle.fits._result import FitResult
@@ -100,12 +100,18 @@ def fit_text(result: FitResult, *, everything: bool = False) -> str:
         lines += [f"  {sentence}" for sentence in skipped_models(result.ladder)]
         lines += [f"  {sentence}" for sentence in _gains(result)]
     lines += _fitted_targets(result)
-    lines += [f"  {sentence}" for sentence in result.advice]
+    if not everything:
+        lines += [f"  {sentence}" for sentence in result.advice]
+    elif result.adequacy is not None and result.adequate is False:
+        factor = result.adequacy.widening
+        lines.append(
+            f"  standard errors are widened by a factor of {factor:.2g}: it misses the data"
+        )
     # the short text has no contraction time
     notices = [n for n in result.notices if everything or not n.startswith("contraction_time")]
     lines += [f"  note: {notice}" for notice in notices]
     lines += [f"  {sentence}" for sentence in result.remarks]
-    if everything or result.adequate is not False:
+    if everything or (result.success and result.adequate is not False):
         whole = everything or len(result.parts) > 1 or result.only.stiffness is not None
         lines += _whole_model(result, everything) if whole else _short_model(result)
     return folded(lines)
@@ -123,7 +129,8 @@ def _measured(result: FitResult) -> list[str]:
         rows = [
             measured_line(words, key, found[key]) for key, words in SHOWN.items() if key in found
         ]
-        rows += tremor_lines(found, tremor_band(target.quantity)) if "tremor_p" in found else []
+        if found.keys() >= TREMOR.keys():
+            rows += tremor_lines(found, tremor_band(target.quantity))
         lines += [f"    {row}" for row in rows]
         if is_recorded(found) and len(target.segments or ()) < ENOUGH:
             lines.append(f"    {WITHIN}")

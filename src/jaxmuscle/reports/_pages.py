@@ -65,8 +65,14 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
     }
     body = [
         _verdict(card.heading, good=False if not result.success else result.adequate),
-        pages.heading("What is measured"),
-        pages.table(PARAMETERS[:STATE], [row[:STATE] for row in rows["measured"]]),
+        *(
+            [
+                pages.heading("What is measured"),
+                pages.table(PARAMETERS[:STATE], [row[:STATE] for row in rows["measured"]]),
+            ]
+            if rows["measured"]
+            else []
+        ),
         pages.heading("What the data determine" if result.adequate is not False else WOULD),
         (
             pages.table(PARAMETERS, rows["determined"])
