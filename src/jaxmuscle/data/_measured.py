@@ -2,7 +2,7 @@
 tremor, regularity."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -63,18 +63,19 @@ def is_recorded(measures: Measures) -> bool:
 
 def measure_signals(
     signals: Sequence[Float[np.ndarray, " _"]], unit: str, band: tuple[float, float]
-) -> tuple[list[Measures], Measures]:
-    """The measures that `steadiness` lists, of each of several signals and of all together.
+) -> tuple[Iterator[Measures], Measures]:
+    """The measures that `steadiness` lists, of each of several signals, whose tremor is looked for
+    when they are asked for, and of all together.
 
     The signals are those of one person in one condition, sampled and low-passed as `RECORDED` says.
     """
     settings = _settings_for_band(band)
     segments = [_segments(x, settings) for x in signals]
     own = [_own(x, unit) for x in signals]
-    each = [
+    each = (
         _stated(m | _measure_tremor([s], settings, band, m), 1, len(s))
         for m, s in zip(own, segments, strict=True)
-    ]
+    )
     together = {name: _together([m[name] for m in own]) for name in own[0]}
     together |= _measure_tremor(segments, settings, band, together)
     return each, _stated(together, len(signals), sum(map(len, segments)))

@@ -235,7 +235,7 @@ def steadiness(
         )
     if len(each) < ENOUGH:
         said = (*said, *_notice_wandering(signals))
-    notices = (*said, *_mind(durations, together, own))
+    notices = (*said, *_mind(durations, together, list(trials.values())))
     unit, quantity = each[0].unit, each[0].quantity
     return Steadiness(together, trials, durations, unit, quantity, band, notices)
 

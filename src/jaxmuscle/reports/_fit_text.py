@@ -8,7 +8,7 @@ import numpy as np
 from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._measured import is_recorded, tremor_band
-from jaxmuscle.data._measured_text import TREMOR, measured_line, tremor_lines
+from jaxmuscle.data._measured_text import REGULAR, TREMOR, WORDS, measured_line, tremor_lines
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._part import RELATIVE, Estimate, FittedPart, once
 from jaxmuscle.fits._result import FitResult
@@ -23,16 +23,12 @@ from ._ladder_text import gain_sentences, ladder_table, skipped_models
 LENGTHS = ("x_ref_w", "x_ref_z")
 OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
 BROAD = 1.7 * 3.92  # standard errors: an interval that is wider than theirs
-# measured numbers that a fit prints
+# measured numbers that a fit prints, in words
 SHOWN = {
-    "mean": "mean",
-    "standard_deviation": "standard deviation",
-    "coefficient_of_variation": "coefficient of variation",
-    "coefficient_of_variation_without_drift": "  without a straight drift",
+    **{name: words for name, words in WORDS.items() if not name.endswith("_above_0.5")},
     "relative_power_4_8": "power 4-8 Hz, 1e-6 mean²",
     "relative_power_8_12": "power 8-12 Hz, 1e-6 mean²",
-    "median_frequency": "median frequency",
-    "sample_entropy": "sample entropy",
+    **{name: REGULAR[name] for name in ("median_frequency", "sample_entropy")},
 }
 HALF_POWER = "half_power_frequency"
 STATED = ("resonance_frequency", "resonance_2_frequency", "harmonic_frequency", HALF_POWER)

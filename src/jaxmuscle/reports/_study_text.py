@@ -19,26 +19,18 @@ if TYPE_CHECKING:
 MOST = 12  # comparisons on a terminal
 TREMOR = "tremor_frequency"
 LABEL, COLUMN, ACROSS, LONGEST = 32, 16, 3, 14  # letters, and columns beside each other
-PERCENT, MILLIONTHS = (100.0, " %"), (1e6, " 1e-6 mean²")
-# Table 1 on a terminal: words and what the numbers are multiplied with
+# Table 1: words, unit (None: that of the recordings) and what the numbers are multiplied with
 SHOWN = {
-    "mean": ("mean [unit]", 1.0),
-    "standard_deviation": ("standard deviation [unit]", 1.0),
-    "coefficient_of_variation": ("coefficient of variation [%]", 100.0),
-    "coefficient_of_variation_without_drift": ("  without a drift [%]", 100.0),
-    "relative_power_4_8": ("power 4-8 Hz [1e-6 mean²]", 1e6),
-    "relative_power_8_12": ("power 8-12 Hz [1e-6 mean²]", 1e6),
-    "median_frequency": ("median frequency [Hz]", 1.0),
-    "sample_entropy": ("sample entropy", 1.0),
-    "tremor_frequency": ("tremor frequency [Hz]", 1.0),
-    "tremor_size": ("tremor size [% of the mean]", 100.0),
-}
-SCALES = {
-    "coefficient_of_variation": PERCENT,
-    "coefficient_of_variation_without_drift": PERCENT,
-    "relative_power_4_8": MILLIONTHS,
-    "relative_power_8_12": MILLIONTHS,
-    "tremor_size": PERCENT,
+    "mean": ("mean", None, 1.0),
+    "standard_deviation": ("standard deviation", None, 1.0),
+    "coefficient_of_variation": ("coefficient of variation", "%", 100.0),
+    "coefficient_of_variation_without_drift": ("  without a drift", "%", 100.0),
+    "relative_power_4_8": ("power 4-8 Hz", "1e-6 mean²", 1e6),
+    "relative_power_8_12": ("power 8-12 Hz", "1e-6 mean²", 1e6),
+    "median_frequency": ("median frequency", "Hz", 1.0),
+    "sample_entropy": ("sample entropy", "", 1.0),
+    "tremor_frequency": ("tremor frequency", "Hz", 1.0),
+    "tremor_size": ("tremor size", "% of the mean", 100.0),
 }
 
 
@@ -102,12 +94,13 @@ def table_1(study: "StudyResult") -> tuple[list[str], list[tuple[str, list[str]]
     found = {(r["group"], r["condition"], r["quantity"]): r for r in study.table_1()}
     columns = list(dict.fromkeys((group, condition) for group, condition, _ in found))
     lines = []
-    for name, (words, scale) in SHOWN.items():
+    for name, (words, unit, scale) in SHOWN.items():
         rows = [found[(*column, name)] for column in columns if (*column, name) in found]
         if len(rows) == len(columns):
             digits = _digits([scale * row["sd"] for row in rows])
-            unit = words.replace("[unit]", f"[{rows[0]['unit']}]")
-            lines.append((unit, [_mean_in_words(row, scale, digits) for row in rows]))
+            unit = rows[0]["unit"] if unit is None else unit
+            head = words + f" [{unit}]" * bool(unit)
+            lines.append((head, [_mean_in_words(row, scale, digits) for row in rows]))
         if name == TREMOR and rows:
             lines.append(("tremor seen in", [f"{row['n']} of {row['people']}" for row in rows]))
     return [", ".join(filter(None, column)) or "all" for column in columns], lines
@@ -129,11 +122,12 @@ def _mean_in_words(row: Mapping[str, Any], scale: float, digits: int) -> str:
 
 def difference_in_words(d: Difference) -> tuple[str, str]:
     """What is compared with what; the difference with its interval and unit."""
-    scale, unit = SCALES.get(d.quantity, (1.0, "" if d.unit == "1" else f" {d.unit}"))
+    _, unit, scale = SHOWN.get(d.quantity, ("", None, 1.0))
+    unit = ("" if d.unit == "1" else d.unit) if unit is None else unit
     where = f", {d.where}" if d.kind == "groups" and d.where else ""
     of = f", change {d.where}" if d.kind == "interaction" else where
     middle, low, high = (f"{scale * x:.3g}" for x in (d.difference, d.low, d.high))
-    return f"{d.quantity}{of}: {d.b} - {d.a}", f"{middle} ({low} to {high}){unit}"
+    return f"{d.quantity}{of}: {d.b} - {d.a}", f"{middle} ({low} to {high}) {unit}".rstrip()
 
 
 def _sentence(d: Difference, alpha: float) -> str:
