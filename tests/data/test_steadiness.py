@@ -281,6 +281,7 @@ def test_a_band_is_looked_through(found):
     slower = jm.steadiness(trials(), band=(3.0, 6.0))
     assert slower.band == (3.0, 6.0) and not 8 < slower["tremor_frequency"].value < 10
     assert found.band == (6.0, 12.0) and "tremor, 6 to 12 Hz " in str(found)
+    assert "size that would show" not in str(found)  # it shows
     moving = jm.steadiness(jm.Recording(forces(3, 15.0)[0] - LEVEL, RATE, unit="mm"))
     assert moving.band == (3.0, 20.0) and moving["tremor_size"].unit == "mm"
     assert moving["tremor_frequency"].value == pytest.approx(9, abs=1)
@@ -308,6 +309,7 @@ def test_no_tremor_is_no_number():
     assert re.search(
         r"\ntremor, 6 to 12 Hz +none seen, p = 0\.\d+\n  size that would show ", str(none)
     )
+    assert "size that would show is seen in nine of ten" in " ".join(str(none).split())
 
 
 def test_rates_may_differ():

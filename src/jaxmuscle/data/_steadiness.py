@@ -33,8 +33,11 @@ ALL = "all"
 ALIKE = 1.2  # longest trial over shortest
 PEAK = (
     "A tremor is stated if the spectrum has a peak that at most 1 in 100 smooth spectra would show"
-    " by chance (p <= 0.01). A tremor of the size that would show is seen in nine of ten such"
-    " recordings; a smaller one may be there unseen."
+    " by chance (p <= 0.01)."
+)
+UNSEEN = (
+    " A tremor of the size that would show is seen in nine of ten such recordings; a smaller one"
+    " may be there unseen."
 )
 NEXT, WANDERS = 12, 0.05  # ordinates; level of the test whether the slowest of them stand out
 
@@ -110,7 +113,7 @@ class Steadiness(Printed, Result, eqx.Module):
                 f"Steadiness of {what}: {self.quantity or 'signal'} [{self.unit}], {long}",
                 *measured_lines(self.measures, self.band),
                 _of_errors(count),
-                PEAK,
+                PEAK + UNSEEN * math.isnan(self.measures["tremor_frequency"].value),
                 *(f"notice: {notice}" for notice in self.notices),
             ]
         )
