@@ -1,7 +1,7 @@
 """How often the ladder of a fit chooses the right model, and whether what it then states is right,
 on simulated recordings.
 
-    python benchmarks/ladder.py selection|line|recovery [--count N]
+    python benchmarks/ladder.py selection|recovery [--count N]
 
 Takes a quarter of an hour to an hour each; the outcome stands in docs/force.md.
 """
@@ -113,47 +113,6 @@ def selection(count: int) -> None:
             )
 
 
-def line(count: int) -> None:
-    """What is said of a line of zero width and of a resonance narrower than a bin."""
-    twitch = QUIET.replace(activation_time=TWITCH)
-    still = twitch.replace(harmonic_amplitude=0.0)
-    with jax.enable_x64(True):
-        narrow = still.with_parts(noise=still.noise + jm.ResonantNoise(0.005, 9.0, 0.2))
-        truths = {
-            "line at 4.25 Hz, base model": QUIET,
-            "line at 9 Hz, activation": with_shares(
-                twitch.replace(harmonic_frequency=9.0), {"harmonic": 0.05}
-            ),
-            "resonance at 9 Hz, 0.2 Hz wide, activation": with_shares(narrow, {"resonance": 0.05}),
-        }
-    for design in ("60 s", "ten trials of 15 s"):
-        for number, (name, task) in enumerate(truths.items()):
-            said: collections.Counter[str] = collections.Counter()
-            for target in simulated(task, design, count, 500 + 10 * DESIGNS[design][1] + number):
-                result = fitted(target, check_seeds=8)
-                notices = [
-                    notice for notice in result.notices if "a line of zero width (AIC" in notice
-                ]
-                said[verdict_of(notices[0] if notices else "") + f" (rung {chosen(result)})"] += 1
-            print(
-                f"{design}, {name} ({described(task)}): "
-                + ", ".join(f"{v} {k}" for k, v in sorted(said.items())),
-                flush=True,
-            )
-
-
-def verdict_of(notice: str) -> str:
-    endings = {
-        "cannot be told apart": "cannot be told apart",
-        "the line": "line",
-        "the resonance": "resonance",
-    }
-    return next(
-        (word for ending, word in endings.items() if ending in notice.partition(")")[2]),
-        "not asked",
-    )
-
-
 def recovery(count: int) -> None:
     """How often stated intervals hold the truth, of a tremor at 9 Hz, 2 Hz wide."""
     task = truth(2)
@@ -189,7 +148,7 @@ def recovery(count: int) -> None:
         )
 
 
-STUDIES = {"selection": selection, "line": line, "recovery": recovery}
+STUDIES = {"selection": selection, "recovery": recovery}
 
 if __name__ == "__main__":
     run(STUDIES, __doc__, 100)

@@ -19,12 +19,11 @@ def cost_of(residuals, prior, theta):
     return 0.5 * np.sum(residuals**2) + 0.5 * np.sum(prior * theta**2)
 
 
-def told(residuals, jacobian, prior, theta, known=DETERMINED, settled=False):
+def told(residuals, jacobian, prior, theta, known=DETERMINED, settled=False, starts=()):
     cost = cost_of(residuals, prior, theta)
     final = Minima(theta[None], np.array([cost]), np.array([64]), np.array([settled]))
-    return convergence(
-        final, residuals, jacobian, prior, theta, known, (Start(cost, False, 64),), 64
-    )
+    starts = starts or (Start(cost, False, 64),)
+    return convergence(final, residuals, jacobian, np.diag(prior), theta, known, starts, 64)
 
 
 @pytest.fixture
@@ -88,3 +87,20 @@ def test_the_linear_response_against_fresh_seeds():
         np.max(np.abs(off * expected) / scipy.stats.sem(each))
     )
     assert found["largest_deviation_sd"] == pytest.approx(np.max(np.abs(np.log(1 + off)) / sd))
+
+
+@pytest.mark.parametrize(
+    ("ended", "words"),
+    [
+        ("peak 1, spread 1.4, spread 3", "converged: 2 of 3 starts reach this minimum"),
+        ("peak 1, spread 1.6", "best of 2 starts, found once (from peaks): a better minimum may"),
+        ("spread 1, spread 1, peak 2", "best of 3 starts, found 2 times, by one kind of start"),
+        ("spread 1", "converged: 1 of 1 starts"),
+    ],
+)
+def test_only_two_kinds_of_start_at_one_minimum_are_called_converged(quadratic, ended, words):
+    residuals, jacobian, prior, theta, _ = quadratic
+    each = (start.split() for start in ended.split(", "))
+    starts = tuple(Start(float(cost), True, 9, kind=kind) for kind, cost in each)
+    success, message = told(residuals, jacobian, prior, theta, settled=True, starts=starts)
+    assert success and message.startswith(words)

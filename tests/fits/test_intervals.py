@@ -229,7 +229,7 @@ def test_stated_intervals_hold_the_truth(x64):
         problem, objective, seen = fitted(BENT, drawn(truth, 12, seed), theta)
         found = consequences(objective, seen)
         scatter = residual_covariance(problem.parts[0].target, objective.parts[0], np.zeros(30))
-        covariance = parameter_covariance(found.jacobian, scatter, problem.prior)
+        covariance = parameter_covariance(found.jacobian, scatter, problem.precision)
         value = float(found.values[0][NAME])
         low, high = half_power_intervals(problem, objective, seen, covariance, {NAME: 1.0})[
             NAME

@@ -276,7 +276,7 @@ def test_the_joint_problem_is_its_parts(x64):
     columns = [list(range(8)), [0, 1, 8, 3, 4, 5, 6, 7]]
     for i, (part, own) in enumerate(zip(objective.parts, columns, strict=True)):
         alone = expand(
-            Residuals((part,), part.coordinates, np.ones(8), np.ones(8), (tuple(range(8)),)),
+            Residuals((part,), part.coordinates, np.eye(8), np.ones(8), (tuple(range(8)),)),
             theta[:, own],
         )
         np.testing.assert_array_equal(seen.moments[i].power, alone.moments[0].power)
@@ -623,19 +623,12 @@ def test_two_targets_climb_together_and_their_aic_is_that_of_both(x64):
     with without_intervals():
         found = jm.fit_joint(pair, rungs=2, starts=8, seeds=0, check_seeds=0)
     numbers = [rung.number for rung in found.ladder]
-    assert (
-        numbers == [0, 1, 2]
-        and found.ladder[0].p < 0.01
-        and found.ladder[2].chosen
-        and found.adequate
-    )
-    rung = found.ladder[2]
+    assert numbers == [2] and found.adequate  # a tremor is seen
+    (rung,) = found.ladder
     height = sum(float(jm.log_likelihood(part.task, part.target)) for part in found.parts.values())
     assert rung.aic == pytest.approx(2 * rung.parameters - 2 * height, abs=0.05)
     assert abs(found["resonance_frequency"].value - float(truth["resonance_frequency"])) < 1.0
-    assert "with a resonance instead of the harmonic the AIC falls by" in " ".join(
-        found.details().split()
-    )
+    assert "the spectrum shows a tremor" in " ".join(found.details().split())
     with pytest.raises(ValueError, match="rungs = 2: give at most 3, and no tasks"):
         jm.fit_joint(pair, rungs=2, tasks={name: jm.Isometric() for name in pair})
 

@@ -288,8 +288,8 @@ def test_the_file_has_the_entries_of_the_design(tmp_path):
     )
     assert set(table["spectrum"]) >= {"frequency_hz", "target", "fitted"}
     assert table["starts"] == [
-        {"cost": 1.5, "success": True, "steps": 12, "values": [4e5, 50 / 3]},
-        {"cost": None, "success": False, "steps": 3, "values": []},
+        {"cost": 1.5, "success": True, "steps": 12, "values": [4e5, 50 / 3], "kind": "spread"},
+        {"cost": None, "success": False, "steps": 3, "values": [], "kind": "spread"},
     ]
 
 

@@ -1,5 +1,4 @@
-"""The ladder: the base model while it describes the data, then activation, tremor and a second
-resonance."""
+"""The ladder: the model that the peaks ask for, and richer ones until one describes the data."""
 
 import functools
 from typing import Any
@@ -14,14 +13,17 @@ from scipy.optimize import brentq
 import jaxmuscle as jm
 from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._checks import mass_notices, twitch_notices
-from jaxmuscle.fits._ladder import _fewer, criterion, told_apart
+from jaxmuscle.fits._ladder import _fewer, criterion, first_rung
 from jaxmuscle.fits._part import Estimate
-from jaxmuscle.model._rungs import RUNGS
-from jaxmuscle.objective._arguments import COEFFICIENTS, FitOptions, planned
+from jaxmuscle.fits._peaks import find_slower_peak, find_tremor, find_unseen
+from jaxmuscle.fits._reopened import reopened
+from jaxmuscle.model._rungs import QUIET, RUNGS
+from jaxmuscle.objective._arguments import DAMPING_SD, FitOptions, planned
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._derived import derived_names
 from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._linearised import linearised
 from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -49,19 +51,22 @@ def expected(task: jm.Isometric) -> np.ndarray:
 
 
 @functools.cache
+def climbed() -> jm.fits.FitResult:
+    return jm.fit(TASK, drawn(expected(with_tremor()), 90, 1), **QUICK)
+
+
+@functools.cache
 def climbed_and_told() -> tuple[jm.fits.FitResult, list[tuple[str, float]]]:
+    """Of a muscle with a slow twitch and no tremor, over many segments."""
+    task = jm.on_rung(TASK, 1).replace(activation_time=0.15, harmonic_amplitude=1e-4)
     told: list[tuple[str, float]] = []
     result = jm.fit(
         TASK,
-        drawn(expected(with_tremor()), 90, 1),
+        drawn(expected(task), 900, 1),
         progress=lambda *said: told.append(said),
         **QUICK,
     )
     return result, told
-
-
-def climbed() -> jm.fits.FitResult:
-    return climbed_and_told()[0]
 
 
 # --- the models
@@ -103,19 +108,115 @@ def test_a_task_that_stands_on_a_rung_is_not_lifted_again():
 def test_frequency_and_width_of_what_has_no_amplitude_are_not_free(x64):
     plan = planned(jm.on_rung(TASK, 2), drawn(expected(TASK), 12, 1), FitOptions())
     assert not {"harmonic_amplitude", "harmonic_frequency"} & set(plan.problem.coordinates.names)
-    sd = dict(zip(plan.problem.coordinates.names, plan.problem.coordinates.sd, strict=True))
-    assert all(sd[name] == 0.5 for name in COEFFICIENTS)
+
+
+# --- the damping ratio has a prior
+
+
+def damping_ratio(task: jm.Isometric) -> float:
+    """ζ of s² + 2 ζ ω s + ω², the characteristic polynomial of the linearised muscle."""
+    A = np.asarray(linearised(task).system.A)
+    return float(-np.trace(A) / (2 * np.sqrt(np.linalg.det(A))))
+
+
+def test_the_row_of_the_damping_ratio_is_its_slope(x64):
+    """At next to no force, where tangents are the values at rest, against the eigenvalues."""
+    task = jm.on_rung(TASK, 2).replace(P_w=1e-6)
+    problem = planned(task, drawn(expected(TASK), 12, 1), FitOptions()).problem
+    (row,), c = problem.damping, problem.coordinates
+    for i, name in enumerate(c.names):
+        step = 1e-4
+        moved = task.replace(**{name: float(task[name]) * np.exp(step * c.sd[i])})
+        slope = np.log(damping_ratio(moved) / damping_ratio(task)) / step / DAMPING_SD
+        assert row[i] == pytest.approx(slope, abs=2e-3), name
+    assert np.count_nonzero(row) == 4
+
+
+def test_a_muscle_without_activation_and_a_moved_one_have_no_such_prior(x64):
+    target = drawn(expected(TASK), 12, 1)
+    assert planned(TASK, target, FitOptions()).problem.damping == ()
+    task = jm.on_rung(TASK, 1)
+    assert planned(task, target, FitOptions(), moved=True).problem.damping == ()
+    plan = planned(task, target, FitOptions(priors={"damping_ratio": None}))
+    assert plan.problem.damping == () and plan.settings["damping_ratio_sd"] is None
+    own = planned(task, target, FitOptions(priors={"damping_ratio": 0.25})).problem
+    usual = planned(task, target, FitOptions()).problem
+    np.testing.assert_allclose(own.damping[0], 2 * usual.damping[0])
+
+
+def test_the_prior_of_a_fit_is_that_of_all_that_follows(x64):
+    problem = reopened(climbed())
+    (row,) = problem.damping
+    theta = problem.theta_of((climbed().task,))
+    residuals = problem.prior_root @ theta
+    assert np.sum(residuals**2) == pytest.approx(np.sum(theta**2) + (row @ theta) ** 2)
+    assert reopened(climbed(), priors={"damping_ratio": None}).damping == ()
+
+
+def test_targets_that_share_a_muscle_have_one_prior_of_its_damping(x64):
+    from jaxmuscle.fits._joint import planned_jointly
+
+    task, target = jm.on_rung(TASK, 2), drawn(expected(TASK), 12, 1)
+    tasks, targets = {"a": task, "b": task}, {"a": target, "b": target}
+    shared = planned_jointly(tasks, targets, FitOptions()).problem
+    apart = planned_jointly(tasks, targets, FitOptions(), separate=("c_w",)).problem
+    assert len(shared.damping) == 1 and len(apart.damping) == 2
+
+
+# --- what the peaks ask for
+
+
+def test_a_tremor_asks_for_a_resonance_and_with_a_slower_peak_for_two():
+    f, plain = TASK.settings.frequency, expected(TASK.replace(harmonic_amplitude=0.0))
+
+    def peaked(*at: float) -> jm.Target:
+        bells = [3 * np.exp(-(((f - each) / 0.7) ** 2)) for each in at]
+        return drawn(plain * (1 + sum(bells)), 60, 2)
+
+    tremor, slower, neither = peaked(9.0), peaked(3.5), drawn(plain, 60, 2)
+    assert abs((find_tremor(tremor) or 0) - 9.0) < 0.5
+    assert abs((find_slower_peak(slower) or 0) - 3.5) < 0.5
+    assert find_tremor(neither) is find_tremor(slower) is find_slower_peak(neither) is None
+    assert first_rung([neither, tremor], 0, 3) == first_rung([tremor], QUIET, 3) == 2
+    assert first_rung([slower], QUIET, 3) == first_rung([neither], QUIET, 3) == QUIET
+    assert first_rung([tremor], 0, 1) == 1  # no more were allowed
+    assert first_rung([slower, tremor], 0, 3) == 2 and first_rung([peaked(3.5, 9.0)], 0, 3) == 3
+    # of what cannot be tested nothing is asked
+    unknown = jm.Target("unknown", tremor.proportional_power, sigma=0.1 * tremor.proportional_power)
+    assert find_tremor(unknown) is find_slower_peak(unknown) is None
+
+
+def test_a_resonance_is_stated_for_a_peak_alone(x64):
+    f, plain = TASK.settings.frequency, expected(TASK.replace(harmonic_amplitude=0.0))
+    seen = drawn(plain * (1 + 3 * np.exp(-(((f - 9.0) / 0.7) ** 2))), 60, 2)
+    unseen = drawn(plain, 60, 2)
+
+    def left_out(target: jm.Target, **values: float) -> set[str]:
+        task = jm.on_rung(TASK, 3)
+        problem = planned(task, target, FitOptions()).problem
+        table = {"corner_frequency": 1.0, "resonance_width": 2.0, "resonance_2_width": 2.0}
+        table |= {"resonance_frequency": 9.0, "resonance_2_frequency": 3.0, "K_w0": 1.0} | values
+        without, said = find_unseen(problem, {n: Estimate(v, "", 0.1) for n, v in table.items()})
+        assert bool(without) == bool(said)
+        return without
+
+    slower = {"resonance_2_frequency", "resonance_2_width"}
+    faster = {"resonance_frequency", "resonance_width"}
+    assert left_out(seen) == slower
+    assert left_out(unseen) == slower | faster
+    assert left_out(seen, resonance_frequency=13.0) == slower | faster
+    assert left_out(seen, corner_frequency=8.6) == slower | {"corner_frequency"}
 
 
 # --- the climb
 
 
 def test_the_base_model_is_kept_where_it_describes_the_data():
-    result = jm.fit(TASK, drawn(expected(TASK), 30, 3), **QUICK)
+    result = jm.fit(TASK, drawn(expected(TASK), 30, 4), **QUICK)
     (only,) = result.ladder
     assert only.number == 0 and only.chosen and result.adequate
     assert result.task.activation is None
-    same = jm.fit(TASK, drawn(expected(TASK), 30, 3), rungs=0, **QUICK)
+    same = jm.fit(TASK, drawn(expected(TASK), 30, 4), rungs=0, **QUICK)
     assert same.ladder == () and same.parameters == result.parameters
 
 
@@ -126,21 +227,26 @@ def test_more_starts_count_for_every_model(asked, found):
     assert _fewer(asked) == found
 
 
-def test_a_tremor_is_climbed_to_and_found():
+def test_a_tremor_that_is_seen_is_fitted_from_the_first():
     result = climbed()
-    chosen = next(rung for rung in result.ladder if rung.chosen)
-    assert chosen.number == 2 and result.adequate
-    assert [rung.number for rung in result.ladder] == [0, 1, 2] and result.ladder[0].p < 0.01
-    assert chosen.aic == min(rung.aic for rung in result.ladder)
+    (only,) = result.ladder
+    assert only.number == 2 and only.chosen and result.adequate
     found = result.derived["resonance_frequency"]
     assert found.stderr is not None and abs(found.value - 9.0) < 3 * found.stderr < 1.5
+    assert "the spectrum shows a tremor" in " ".join(result.details().split())
+
+
+def test_a_richer_model_is_tried_where_the_first_does_not_describe_the_data():
+    result, _ = climbed_and_told()
+    assert [rung.number for rung in result.ladder] == [0, 1] and result.ladder[0].p < 0.01
+    chosen = next(rung for rung in result.ladder if rung.chosen)
+    assert chosen.number == 1 and result.adequate
+    assert chosen.aic == min(rung.aic for rung in result.ladder)
     text = result.details()
-    assert "models tried" in text and "-> 2 with a resonance instead of the harmonic" in text
-    poorer, words = result.ladder[1], " ".join(text.split())
-    assert (
-        "with a resonance instead of the harmonic the AIC falls by"
-        f" {poorer.aic - chosen.aic:.1f} (chi2 per bin" in words
-    )
+    assert "models tried" in text and "-> 1 with activation" in text
+    assert "for the description alone" in " ".join(text.split())
+    kinds = {start.kind for start in result.starts}
+    assert kinds == {"other model", "peak", "spread"}
 
 
 def test_the_progress_says_which_model_it_is_at_and_never_falls_back():
@@ -148,20 +254,10 @@ def test_the_progress_says_which_model_it_is_at_and_never_falls_back():
     shares = [share for _, share in told]
     assert shares == sorted(shares) and shares[-1] == 1
     models = [text.partition(":")[0] for text, _ in told if text.startswith("model ")]
-    assert list(dict.fromkeys(models)) == [f"model {k} (of models 0 to 3)" for k in (0, 1, 2)]
+    assert list(dict.fromkeys(models)) == [f"model {k} (of models 0 to 3)" for k in (0, 1)]
     assert "model 1 (of models 0 to 3): with activation" in dict(told)
     # the descents' share of a fit
-    assert max(share for text, share in told if text.startswith("model 2")) <= 3 / 4 * 0.6
-
-
-def test_a_significant_line_is_tried_against_the_tremor():
-    """A short recording of a tremor: the base model describes it, with a line. Rung 1 has it, too,
-    so rung 2 is tried."""
-    with without_intervals():
-        result = jm.fit(TASK, drawn(expected(with_tremor()), 12, 0), **QUICK)
-    first, tremor = result.ladder
-    assert (first.number, tremor.number) == (0, 2) and first.p > 0.1
-    assert first.chosen == (tremor.aic > first.aic - 2)
+    assert max(share for text, share in told if text.startswith("model 1")) <= 2 / 4 * 0.6
 
 
 def test_a_chosen_model_or_noise_is_not_climbed_from():
@@ -188,12 +284,6 @@ def test_the_criterion_is_akaikes(x64):
 
     height = float(log_likelihood(problem.tasks_at(theta)[0], target))
     assert aic == pytest.approx(2 * parameters - 2 * height, abs=1e-6)
-
-
-def test_alike_is_said_and_different_is_said():
-    assert "cannot be told apart" in told_apart(-100.0, -101.9)
-    assert "prefer the line" in told_apart(-110.0, -101.0)
-    assert "prefer the resonance" in told_apart(-100.0, -120.0)
 
 
 def test_an_active_mass_far_from_its_prior_is_told():
@@ -291,8 +381,6 @@ def test_half_power_frequency_against_a_root_of_the_transfer_function(x64):
     task = result.task
     k, c = task.muscle.base()[:2], task.muscle.base()[2:]
     # About x_w at rest: K_w x_w³ and so on, the tangent of the quadratic laws.
-    from jaxmuscle.response._linearised import linearised
-
     A = np.asarray(linearised(task).system.A)
     T = float(task["activation_time"])
 

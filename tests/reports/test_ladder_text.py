@@ -1,79 +1,48 @@
-"""What the models that were tried are said to gain."""
+"""Why a model was chosen, in words."""
 
-from jaxmuscle.comparison._comparison import NEEDED
 from jaxmuscle.fits._ladder import Rung
-from jaxmuscle.reports._ladder_text import gain_sentences, skipped_models
+from jaxmuscle.reports._ladder_text import explain_choice
 
 
-def tried(*aics: tuple[int, float], chosen: int) -> tuple[Rung, ...]:
-    """Models of these numbers and AICs; the chi² of each is a tenth of the distance of its AIC from
-    -100."""
-    return tuple(Rung(n, f"{n}", aic, 5.0, (aic + 100) / 10, 0.3, n == chosen) for n, aic in aics)
-
-
-def test_every_part_of_the_chosen_model_says_what_it_gains_over_the_poorer_one():
-    said = gain_sentences(
-        tried((0, -10.0), (1, -60.0), (2, -59.5), (3, -90.0), chosen=2), describes=True
-    )
-    assert said[:-1] == (
-        "with activation the AIC falls by 50.0 (chi2 per bin 4.00 instead of 9.00)",
-        (
-            "with a resonance instead of the harmonic the AIC rises by 0.5 (chi2 per bin 4.05"
-            " instead of 4.00)"
-        ),
-    )
-    assert "A richer model can fit worse here" in said[-1]
-    assert (
-        f"2 or less says nothing. jaxmuscle compare is stricter: it needs at least {NEEDED:g}, and"
-        in said[-1]
-    )
-    assert "no p-value" in said[-1] and "No model" not in said[-1]
-
-
-def test_what_a_part_gains_is_counted_from_the_best_model_without_it():
-    worse = gain_sentences(tried((0, -60.0), (1, -50.0), (2, -90.0), chosen=2), describes=True)
-    assert worse[:-1] == (
-        "with activation the AIC rises by 10.0 (chi2 per bin 5.00 instead of 4.00)",
-        (
-            "with a resonance instead of the harmonic the AIC falls by 30.0 against the best model"
-            " before (0) (chi2 per bin 1.00 instead of 4.00)"
-        ),
+def tried(*models: tuple[int, float], chosen: int) -> tuple[Rung, ...]:
+    """Models of these numbers and chi²; only the last one describes the data."""
+    last = models[-1][0]
+    return tuple(
+        Rung(n, f"model {n}", -10.0, 5.0, chi2, 0.3 if n == last else 0.002, n == chosen)
+        for n, chi2 in models
     )
 
 
-def test_a_model_that_is_missing_in_the_table_is_explained():
-    (said,) = skipped_models(tried((0, -10.0), (2, -60.0), chosen=2))
-    assert (
-        said
-        == "model 0 already describes the data, so model 1 was not tried. But the harmonic of model"
-        " 0 is significant (p < 0.05) and may be a tremor, so model 2 was tried as well"
-    )
-    assert skipped_models(tried((0, -10.0), (1, -20.0), chosen=1)) == ()
-    failed = tuple(rung._replace(p=0.001) for rung in tried((0, -10.0), (2, -60.0), chosen=2))
-    assert skipped_models(failed) == ()  # it was tried, and had no finite spectrum
+def test_a_tremor_that_is_seen_is_why_the_first_model_has_a_resonance():
+    (said,) = explain_choice(tried((2, 1.0), chosen=2), tremor=True)
+    assert said == "the spectrum shows a tremor, so the first model tried has a resonance"
+    (said,) = explain_choice(tried((3, 1.0), chosen=3), tremor=True)
+    assert said.endswith("and a slower peak, so the first model tried has two resonances")
+    assert explain_choice(tried((0, 1.0), chosen=0)) == explain_choice(()) == ()
 
 
-def test_what_was_not_tried_is_counted_with_the_next_model():
-    gain, _ = gain_sentences(tried((0, -10.0), (2, -60.0), chosen=2), describes=True)
-    assert gain.startswith(
-        "with activation and with a resonance instead of the harmonic the AIC falls by 50.0 ("
-    )
-    gain, _ = gain_sentences(tried((-1, -10.0), (0, -20.0), chosen=0), describes=True)
-    assert gain.startswith("with a harmonic the AIC falls by 10.0 (")
+def test_a_line_is_said_to_be_tried_beside_a_narrow_resonance():
+    said = explain_choice(tried((0, 1.0), (2, 1.2), chosen=0), tremor=True)
+    assert [words.split(",")[0] for words in said] == [
+        "the spectrum shows a tremor",
+        "that came out narrower than a bin",
+        "the model with the lowest AIC was taken",
+    ]
 
 
-def test_nothing_is_gained_where_the_simplest_model_was_chosen_or_only_one_was_fitted():
-    assert gain_sentences(tried((0, -10.0), (2, -10.5), chosen=0), describes=True) == ()
-    assert (
-        gain_sentences(tried((2, -10.0), chosen=2), describes=True)
-        == gain_sentences((), describes=None)
-        == ()
-    )
+def test_models_that_no_peak_asks_for_are_said_to_be_tried_for_the_description():
+    for ladder, tremor, poorer in (
+        (tried((0, 2.0), (1, 1.5), chosen=1), False, "model 0"),
+        (tried((2, 2.0), (3, 1.5), chosen=3), True, "model 2"),
+        (tried((0, 2.0), (1, 1.5), (2, 1.4), chosen=2), False, "model 0"),
+    ):
+        *_, said, last = explain_choice(ladder, tremor=tremor)
+        assert said.startswith(f"{poorer} does not describe the data (p = 0.002). Richer models")
+        assert "for the description alone" in said and "lowest AIC" in last
 
 
-def test_where_no_model_describes_the_data_a_lower_aic_does_not_show_a_part():
-    *_, meaning = gain_sentences(tried((0, -10.0), (1, -60.0), chosen=1), describes=False)
-    assert (
-        "No model that was tried describes the data" in meaning
-        and "not that the muscle has this part" in meaning
-    )
+def test_a_richer_model_that_fits_worse_is_said_to_do_so():
+    *_, said = explain_choice(tried((0, 2.0), (1, 1.5), (2, 1.75), chosen=2), "datum")
+    assert said == "model 2 fits worse than model 1 (chi2 per datum 1.75 against 1.50)"
+    better = explain_choice(tried((0, 2.0), (1, 1.5), (2, 1.75), chosen=1))
+    assert not any("worse" in words for words in better)

@@ -290,12 +290,13 @@ def test_parameter_covariance_is_the_scatter_of_penalised_fits():
     rng = np.random.default_rng(6)
     jacobian = rng.standard_normal((12, 4)) @ np.diag([5.0, 2.0, 1.0, 0.0])
     root = np.tril(rng.uniform(0.2, 1.0, (12, 12)))
-    prior = np.array([1.0, 1.0, 0.25, 1.0])
-    covariance = parameter_covariance(jacobian, root @ root.T, prior)
+    half = np.diag([1.0, 1.0, 0.5, 1.0])
+    half[0, 1] = 2.0  # the prior joins two of them, as it does what makes a damping ratio
+    covariance = parameter_covariance(jacobian, root @ root.T, half.T @ half)
     draws = 20_000
-    truth = rng.standard_normal((draws, 4)) / np.sqrt(prior)
+    truth = np.linalg.solve(half, rng.standard_normal((4, draws))).T
     data = truth @ jacobian.T + rng.standard_normal((draws, 12)) @ root.T
-    weights = np.vstack([jacobian, np.diag(np.sqrt(prior))])
+    weights = np.vstack([jacobian, half])
     found = np.linalg.lstsq(weights, np.hstack([data, np.zeros((draws, 4))]).T, rcond=None)[0].T
     # In whitened coordinates the entries of the sample covariance are independent.
     errors = np.linalg.solve(np.linalg.cholesky(covariance), (found - truth).T)
@@ -312,7 +313,7 @@ def test_where_the_data_decide_the_covariance_is_that_of_least_squares():
     inverse = np.linalg.pinv(jacobian)
     # The prior enters with the ratio of its precision to that of the data, 1e-8.
     np.testing.assert_allclose(
-        parameter_covariance(jacobian, sigma, np.ones(3)), inverse @ sigma @ inverse.T, rtol=1e-6
+        parameter_covariance(jacobian, sigma, np.eye(3)), inverse @ sigma @ inverse.T, rtol=1e-6
     )
 
 
@@ -434,7 +435,7 @@ def test_correlated_bins_count_for_less():
     independent."""
     jacobian = np.array([[2.0], [2.0]])
     scatter = np.array([[1.0, 0.6], [0.6, 1.0]])
-    left = parameter_covariance(jacobian, scatter, np.ones(1))
+    left = parameter_covariance(jacobian, scatter, np.eye(1))
     found = Identifiability.of_covariance(left)
     assert found.singular_values[0] == pytest.approx(np.sqrt(1 / left[0, 0] - 1))
     assert found.singular_values[0] < identifiability(jacobian).singular_values[0]

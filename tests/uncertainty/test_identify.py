@@ -184,7 +184,7 @@ def highest_posteriors(result, count):
     powers = drawn(result.task, result.target.segments, count, 3)
     (bins,) = jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), likelihood.bins)
     bins = (bins._replace(log_power=np.log(powers)),)
-    peak = maximise(likelihood, np.tile(theta, (count, 1)), problem.prior, bins=bins)
+    peak = maximise(likelihood, np.tile(theta, (count, 1)), problem.precision, bins=bins)
     assert peak.settled.mean() > 0.97
     objective = without_further(problem).linear()
     (values,), _ = quantities(objective, expand(objective, peak.theta))

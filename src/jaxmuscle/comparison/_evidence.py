@@ -53,7 +53,7 @@ class Candidate(NamedTuple):
     """A likelihood of one target with the precision Λ of its prior, and where to begin."""
 
     likelihood: Likelihood
-    precision: Float[np.ndarray, " free"]
+    precision: Float[np.ndarray, "free free"]
     starts: Float[np.ndarray, "starts free"]
 
     @classmethod
@@ -88,7 +88,7 @@ class Candidate(NamedTuple):
         starts = np.concatenate([about, spread, scattered, on])
         if not harmonic:
             starts[:, [n in HARMONIC for n in names]] = 0.0
-        return cls(Likelihood.of(problem), problem.prior, starts)
+        return cls(Likelihood.of(problem), problem.precision, starts)
 
 
 def without_harmonic(problem: FitProblem) -> FitProblem:
@@ -175,7 +175,7 @@ def _climbed(
 
 def effective_numbers(
     curvature: Float[np.ndarray, "sets all all"],
-    precision: Float[np.ndarray, " free"],
+    precision: Float[np.ndarray, "free free"],
     moving: Float[np.ndarray, "sets free"],
 ) -> Float[np.ndarray, " sets"]:
     """Effective numbers of parameters over the moving coordinates; `curvature` is that of θ and the
@@ -183,7 +183,8 @@ def effective_numbers(
     found = []
     for whole, moves in zip(curvature, moving > 0, strict=True):
         both = without_offsets(whole, len(precision))[np.ix_(moves, moves)]
-        found.append(effective_parameters(both - np.diag(precision[moves]), precision[moves]))
+        own = precision[np.ix_(moves, moves)]
+        found.append(effective_parameters(both - own, own))
     return np.array(found)
 
 

@@ -61,6 +61,17 @@ def is_recorded(measures: Measures) -> bool:
     return "standard_deviation" in measures
 
 
+def can_be_tested(target: Any, band: tuple[float, float]) -> bool:
+    """Whether a target has what a test for a peak in a band needs: all bins about it, and
+    segments."""
+    f = target.settings.frequency
+    return (
+        len(target.bins) == len(f)
+        and target.segments is not None
+        and len(bins_in(band, target.settings)) > 0
+    )
+
+
 def measure_signals(
     signals: Sequence[Float[np.ndarray, " _"]], unit: str, band: tuple[float, float]
 ) -> tuple[Iterator[Measures], Measures]:
@@ -199,6 +210,36 @@ def _together(each: list[Measure]) -> Measure:
     return _measure(float(np.mean(values)), error, first.unit, first.error_from)
 
 
+def widened(
+    measures: Measures,
+    signals: Sequence[Float[np.ndarray, " _"]],
+    widening: float,
+    common: float,
+) -> Measures:
+    """The measures of signals whose fluctuations change their size, with the errors that follow.
+
+        s² -> w² s² + a² v x²
+
+    s is the error of a value x, w the `widening`, v, `common`, the relative variance of the mean
+    power by which all frequencies change together (`jaxmuscle.spectra._whitened`); a = 1 of a
+    power, 1/2 of a standard deviation or variation, and 0 of a share or a median, from which what
+    is common cancels. That is done where an error assumes a steady signal. What stands on the
+    scatter of trials or parts, the tremor, which is tested by itself, and the mean, whose error
+    slow ordinates give, stay as they are.
+    """
+    wider = dict(measures)
+    for name, m in measures.items():
+        assumed = m.error_from in ("spectrum", "segments") and name != MEAN
+        if m.stderr is None or not assumed or name.startswith("tremor"):
+            continue
+        power = 1.0 if "power" in name else 0.0 if name.startswith(("share", MEDIAN)) else 0.5
+        error = math.hypot(widening * m.stderr, power * math.sqrt(common) * m.value)
+        wider[name] = Measure(m.value, error, m.unit, m.error_from)
+    settings = _settings_for_band(TREMOR_BAND)
+    stated = _stated(wider, len(signals), sum(settings.segments(len(x)) for x in signals))
+    return {n: stated[n] if m is not measures[n] else m for n, m in wider.items()}
+
+
 def _settings_for_band(band: tuple[float, float]) -> SpectrumSettings:
     """Those of recordings, with the bins that say what is smooth about a band."""
     first, last = bins_around(band, RECORDED)
@@ -285,7 +326,7 @@ def measure_spectrum(target: Any) -> Measures:
     error = np.std([median_frequency(row, settings) for row in drawn])
     found[MEDIAN] = _measure(median_frequency(p, settings), float(error), "Hz", "bins")
     band = tremor_band(target.quantity)
-    if target.segments is not None and len(bins_in(band, settings)):
+    if can_be_tested(target, band):
         found |= _tremor_of_bins(target, band, drawn)
     return _stated(found, len(target.mean or ()), 0)
 

@@ -515,6 +515,7 @@ def pooled_target(
         trial_power=rows if len(rows) > 1 else None,
         settings=settings,
         measured=measure_signals(held, unit, tremor_band(quantity))[1],
+        signals=held,
         notices=notices_of(recordings, signals, settings.rate, drifts, quantity),
     )
 

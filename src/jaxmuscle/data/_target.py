@@ -1,5 +1,6 @@
 """Targets: a measured, digitised or reconstructed proportional power spectrum to fit a model to."""
 
+import dataclasses
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 from . import _target_fields as check
 from ._frequency_response import FrequencyResponse
 from ._measure import Measure
-from ._measured import measure_spectrum
+from ._measured import measure_spectrum, widened
 from ._target_fields import Provenance, Quantity, numbers_of
 from ._target_files import KEYS, REQUIRED, fields_of, on_grid, read_target, settings_of
 
@@ -31,6 +32,13 @@ SUM_TOLERANCE = 1e-3
 # calibration.
 MEAN_ERROR, LEAST_MEAN_ERROR = 0.02, 0.002
 UNUSUAL = 1.25  # dispersion from which trials are said to differ
+
+
+@dataclasses.dataclass(frozen=True)
+class Samples:
+    """The samples of every trial. All are equal: what a target says is its spectrum."""
+
+    each: tuple[Float[np.ndarray, " _"], ...] = dataclasses.field(compare=False, repr=False)
 
 
 class Target(Shown, eqx.Module):
@@ -67,6 +75,8 @@ class Target(Shown, eqx.Module):
       median frequency, tremor) and what is stated here (mean, variation). `measures` has its
       rows.
     - `settings`: how the spectrum was estimated. The model's spectrum is made in the same way.
+    - `signals`: the low-passed samples of every trial at 100 Hz [`unit`], in which a fit looks for
+      what the spectrum cannot show. No file keeps them, and targets that differ in them are equal.
     - `notices`: what was done to the numbers, in sentences.
 
     **Raises:** `TargetError`, a `ValueError`, naming the argument, its value and the remedy.
@@ -91,6 +101,7 @@ class Target(Shown, eqx.Module):
     stiffness: FrequencyResponse | None
     measures: tuple[tuple[Any, ...], ...] | None = eqx.field(static=True)
     settings: SpectrumSettings = eqx.field(static=True)
+    samples: Samples = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(  # noqa: PLR0913 (options of a public call)
@@ -116,6 +127,7 @@ class Target(Shown, eqx.Module):
         | tuple[tuple[Any, ...], ...]
         | None = None,
         settings: SpectrumSettings | None = None,
+        signals: Iterable[np.ndarray] = (),
         notices: Iterable[str] = (),
     ):
         settings = SpectrumSettings() if settings is None else settings
@@ -134,7 +146,7 @@ class Target(Shown, eqx.Module):
         self.mean, self.unit = check.metadata("mean", mean), check.metadata("unit", unit)
         self.reason = check.metadata("reason", reason)
         self.measures = check.metadata("measured", measured)
-        self.settings = settings
+        self.settings, self.samples = settings, Samples(tuple(signals))
         self.stiffness = (
             FrequencyResponse.from_table(stiffness) if isinstance(stiffness, Mapping) else stiffness
         )
@@ -163,6 +175,11 @@ class Target(Shown, eqx.Module):
             )
         own = _own_notices(self, float(np.sum(power)))
         self.notices = tuple(dict.fromkeys((*check.metadata("notices", list(notices)), *own)))
+
+    @property
+    def signals(self) -> tuple[Float[np.ndarray, " _"], ...]:
+        """The samples of every trial; none where only a spectrum is known."""
+        return self.samples.each
 
     @property
     def measured(self) -> dict[str, Measure]:
@@ -291,6 +308,14 @@ class Target(Shown, eqx.Module):
         if self.measures is not None:
             return self
         return Target.from_table(self.to_table() | {"measured": self.measured})
+
+    def with_unsteady_errors(self, widening: float, common: float) -> "Target":
+        """The same with wider errors of what was measured, see `widened`; those of a bare
+        spectrum stay."""
+        if self.measures is None or not self.signals:
+            return self
+        wider = widened(self.measured, self.signals, widening, common)
+        return Target.from_table(self.to_table() | {"measured": wider})
 
     def plot(self, ax: Any = None, *, log: bool = False) -> Any:
         """Draw the spectrum, see `jaxmuscle.plot.target`; `log`: both axes logarithmic. Returns the

@@ -26,10 +26,12 @@ from ._checks import Stage, seen_best
 from ._half_power import HALF_POWER, half_power_intervals
 from ._intervals import Interval, intervals
 from ._refit import STRENGTHS, Refit, refit_of
+from ._signal_checks import SignalTest, check_signals
 
 ADEQUATE = 0.01
 ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
 REPLICATES = 999
+SAMPLES = 5  # of the key, for what is simulated beside the samples
 ELSEWHERE = (
     "The misfit is in the other data. What comes from these may still be right: fit them alone, and"
     " compare (a dynamic stiffness with jaxmuscle fit stiffness.csv)"
@@ -98,7 +100,7 @@ class Endpoint:
     @functools.cached_property
     def covariance(self) -> Float[np.ndarray, "free free"]:
         """That of the estimates, in prior standard deviations."""
-        return parameter_covariance(self.found.jacobian, self.scatter, self.problem.prior)
+        return parameter_covariance(self.found.jacobian, self.scatter, self.problem.precision)
 
     @functools.cached_property
     def judged(self) -> tuple[Adequacy | None, tuple[str, ...]]:
@@ -120,10 +122,24 @@ class Endpoint:
             for part, moments in zip(self.objective.parts, self.seen.moments, strict=True)
         )
 
+    @functools.cached_property
+    def signals(self) -> tuple[SignalTest, ...]:
+        """What the samples of each target show beside its spectrum."""
+        tasks, key = self.problem.tasks_at(self.seen.theta), fold_in(self.problem.key, SAMPLES)
+        return tuple(
+            check_signals(part.target, task, key)
+            for part, task in zip(self.problem.parts, tasks, strict=True)
+        )
+
     @property
     def widening(self) -> float:
-        """By how much the errors grow."""
-        return 1.0 if self.adequacy is None else self.adequacy.widening
+        """By how much the errors grow: where the model does not describe the data, or where their
+        size changes more than the scatter of the trials has widened them already."""
+        unsteady = [
+            test.widening / part.target.overdispersion
+            for test, part in zip(self.signals, self.problem.parts, strict=True)
+        ]
+        return max(1.0 if self.adequacy is None else self.adequacy.widening, *unsteady, 1.0)
 
     def intervals(self, names: list[str]) -> dict[str, Interval]:
         """95 % intervals of these quantities; computed once."""
@@ -237,9 +253,7 @@ def elsewhere(ended: Endpoint) -> float:
         return 0.0
     (a, f), sd = refit.used, problem.coordinates.sd
     residual = np.concatenate([found.residuals, refit.prior])
-    gain = np.linalg.pinv(
-        found.jacobian.T @ found.jacobian + np.diag(problem.prior), hermitian=True
-    )
+    gain = np.linalg.pinv(found.jacobian.T @ found.jacobian + problem.precision, hermitian=True)
     dull = max(1.0, float(sizes[f, f] / gain[f, f]))
     cost = refit.cost(residual[None])[0]
     cost = (cost - cost[-1]) / dull

@@ -1,6 +1,7 @@
 """What is checked about a fit: nonlinear against linear, other minima, transients; and what is said
 about it."""
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -16,7 +17,16 @@ from jaxmuscle.objective._covariance import Identifiability
 from jaxmuscle.objective._least_squares import SMALL, Minima
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
-from jaxmuscle.objective._starts import contenders, frequency_names, harmonic_frequencies
+from jaxmuscle.objective._starts import (
+    ANSWER,
+    OTHER_MODEL,
+    OWN,
+    PEAK,
+    SPREAD,
+    contenders,
+    frequency_names,
+    harmonic_frequencies,
+)
 from jaxmuscle.response._expected import Moments, expected_moments
 from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import BinStatistics, trial_samples
@@ -25,6 +35,15 @@ from jaxmuscle.spectra._settings import WINDOW
 from ._part import Estimate, FittedPart, Start
 
 AMBIGUOUS, OTHER = 2.0, 3.0
+ALIKE = 0.5  # of costs: one minimum
+# how starts began, in words
+BEGAN = {
+    PEAK: "from peaks",
+    ANSWER: "from the measured response",
+    OTHER_MODEL: "from another model",
+    SPREAD: "spread",
+    OWN: "from the task's own values",
+}
 MISSED = 3.0  # standard deviations of a measured mean or variation
 PULLED = 3.0  # prior standard deviations
 # standard errors of a response that is seen clearly; of the tangent stiffness
@@ -236,17 +255,30 @@ def convergence(
     max_steps: int,
 ) -> tuple[bool, str]:
     """Success: a further step gains less than a thousandth of the cost, or only runs along what is
-    not determined."""
+    not determined.
+
+    "Converged" says more: starts of two kinds (or the only one) came to this minimum.
+    """
     cost = final.cost[final.best]
-    curvature = jacobian.T @ jacobian + np.diag(prior)
-    gradient = jacobian.T @ residuals + prior * theta
+    curvature = jacobian.T @ jacobian + prior
+    gradient = jacobian.T @ residuals + prior @ theta
     step = -np.linalg.pinv(curvature, hermitian=True) @ gradient
     gain = -0.5 * gradient @ step / max(cost, 1e-300)
     finite = [s.cost for s in starts if s.cost is not None]
-    near = sum(c <= 1.05 * min(finite) for c in finite) if finite else 0
-    census = f"{near} of {len(starts)} starts reach a fit as good as this (cost within 5 %)"
+    there = [s.kind for s in starts if s.cost is not None and s.cost <= min(finite) + ALIKE]
+    kinds = Counter(there)
+    census = (
+        f"{len(there)} of {len(starts)} starts reach this minimum (cost within {ALIKE:g};"
+        f" {', '.join(f'{count} {BEGAN[kind]}' for kind, count in kinds.items())})"
+    )
     if final.settled[final.best] or gain < SMALL:
-        return True, f"converged: {census}"
+        if len(kinds) > 1 or len(starts) == 1:
+            return True, f"converged: {census}"
+        times = "once" if len(there) == 1 else f"{len(there)} times, by one kind of start"
+        return True, (
+            f"best of {len(starts)} starts, found {times} ({BEGAN[there[0]]}): a better minimum may"
+            " exist. More starts would show (--starts)"
+        )
     along = known.directions[~known.determined] @ step
     if along @ along >= 0.9 * (step @ step):
         return (

@@ -17,7 +17,7 @@ from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import DT, FitOptions, Plan, at_mean, planned
 
-from ._ladder import Models, options_for
+from ._ladder import Models, first_rung, options_for
 from ._perturbed import ANEW, alike, analysed, recordings_of, seen_with, without_rhythm
 from ._result import FitResult
 from ._search import search
@@ -86,7 +86,8 @@ def fit(  # noqa: PLR0913 (options of a public call)
       response; 0: no nonlinear correction)
     - `key`: a `jax.random` key or a seed number
     - `bounds` {name: (low, high)} in the unit of the parameter; infinite where there is none
-    - `priors` {name: sd in log, or None for a flat one}
+    - `priors` {name: sd in log, or None for a flat one}; "damping_ratio" for that of the muscle's
+      damping ratio, which models with activation have (0.5; None: none)
     - `coefficient_of_variation`: whether the target's, if it states one, is one more residual (it
       fixes the scale of the noise)
     - `mean_force` (value, sd) [N] as a further residual, of a task that you have scaled
@@ -97,8 +98,8 @@ def fit(  # noqa: PLR0913 (options of a public call)
       response; 0: not simulated)
     - `dt` [s]: noise grid of a Monte Carlo fit
     - `progress`: True or a function of (text, share)
-    - `rungs`: how many richer models may be tried where the base model does not describe the data
-      (`on_rung`; 3, or 0 where `noise` or `free` is given)
+    - `rungs`: how many richer models may be tried where the spectrum shows a tremor, or the base
+      model does not describe the data (`on_rung`; 3, or 0 where `noise` or `free` is given)
     - `optimiser`: what makes the steps instead of `optimistix.LevenbergMarquardt`: another of
       optimistix's Gauss-Newton solvers, `optimistix.Dogleg(1e-9, 1e-9)` say (for others there is
       `problem`)
@@ -147,7 +148,8 @@ def fit(  # noqa: PLR0913 (options of a public call)
             tell("subtracting the response to the movement", 0.01)
             target = analysed(recordings, without_rhythm(task, options), options)
         top = _top(task, target, options, chosen=noise is not None)
-        plan, models = _models(task, target, options, top, recordings)
+        models = _models(task, target, options, top, recordings)
+        plan = models.plan_at(models.first)
         return search(plan, answer, models if top > models.lowest else None)
 
 
@@ -157,33 +159,27 @@ def _models(
     given: FitOptions,
     top: int,
     recordings: tuple[PerturbedRecording, ...],
-) -> tuple[Plan, Models]:
-    """The fit of the first model, and the richer ones that may follow."""
+) -> Models:
+    """The models that may be fitted: of a moved record also noise alone."""
     base, options = at_mean(task, target, given)
     # no verdict
     unknown = len(target.bins) > 0 and target.segments is None and target.sigma is None
-    first = base if target.stiffness is None or unknown else without_rhythm(base, options)
+    quiet = base if target.stiffness is None or unknown else without_rhythm(base, options)
+    lowest = 0 if quiet is base else QUIET
 
-    def plan_of(task: AbstractTask) -> Plan:
+    def plan_at(number: int) -> Plan:
+        task = quiet if number == QUIET else on_rung(base, number) if number else base
         return planned(task, target, options_for(task, options))
 
-    def renewed(muscles: tuple[AbstractTask, ...]) -> tuple[Plan, Models] | None:
+    def renewed(muscles: tuple[AbstractTask, ...]) -> Models | None:
         """The response was taken off by a muscle of the base model: where that is not chosen, by
         the one that is."""
         given.progress(ANEW, 0.0)
         again = seen_with(muscles[0], recordings)
         return None if alike(target, again) else _models(task, again, given, top, recordings)
 
-    lowest = 0 if first is base else QUIET
-    models = Models(
-        top,
-        lambda number: plan_of(on_rung(base, number)),
-        lowest,
-        base,
-        plan_of,
-        renewed if recordings else None,
-    )
-    return plan_of(first), models
+    first = first_rung([target], lowest, top) if top > lowest else lowest
+    return Models(first, lowest, top, plan_at, renewed if recordings else None)
 
 
 def _top(task: AbstractTask, target: Target, options: FitOptions, *, chosen: bool) -> int:

@@ -9,6 +9,7 @@ from jaxmuscle._common.documents import Table, says
 from jaxmuscle._common.keys import SEEDS
 from jaxmuscle.data._target import Target
 from jaxmuscle.objective._arguments import METHODS, RESIDUALS
+from jaxmuscle.objective._starts import SPREAD
 
 FORMAT = 5
 
@@ -88,6 +89,9 @@ class StartTable(Table, kw_only=True):
             " where that is not finite"
         ),
     ]
+    kind: Annotated[
+        str, says("How it began, see *Starts* in docs/fitting.md", missing="`spread`")
+    ] = SPREAD
 
 
 class CorrelationTable(Table, kw_only=True):
@@ -150,6 +154,13 @@ class SettingsTable(Table, kw_only=True):
         tuple[float, float] | dict[str, tuple[float, float] | None] | None,
         says("Mean and its error [N] as data, or null; of several targets by name"),
     ]
+    damping_ratio_sd: Annotated[
+        float | None,
+        says(
+            "Standard deviation of the logarithm of the damping ratio in its prior, or null: none",
+            missing="none",
+        ),
+    ] = None
     carried: Annotated[
         float | None,
         says(

@@ -137,7 +137,7 @@ class _Search(NamedTuple):
         everywhere = np.tile(here.theta, (len(log_f), 1)), np.tile(log_f, (len(log_f), 1))
         level, g = (x[0] for x in _levels_of(objective, part, *everywhere))
         gain = np.linalg.pinv(
-            here.jacobian[0].T @ here.jacobian[0] + np.diag(problem.prior), hermitian=True
+            here.jacobian[0].T @ here.jacobian[0] + problem.precision, hermitian=True
         )
         ours, stated = (np.einsum("fi,ij,fj->f", g, matrix, g) for matrix in (gain, covariance))
         tight = np.minimum(HELD * np.sqrt(ours), LOOSE)

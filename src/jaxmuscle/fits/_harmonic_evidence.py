@@ -114,8 +114,8 @@ def _p_of_line(ended: Endpoint, kept: Int[np.ndarray, " kept"]) -> float:
     problem, objective, here, found = ended.problem, ended.objective, ended.seen, ended.found
     null, own = here.moments[0], objective.parts[0]
     n, sd = len(problem.parts[0].target.bins), np.asarray(own.statistics.sd)
-    residual = np.concatenate([found.residuals, np.sqrt(problem.prior[kept]) * here.theta[kept]])
-    jacobian = np.concatenate([found.jacobian[:, kept], np.diag(np.sqrt(problem.prior[kept]))])
+    residual = np.concatenate([found.residuals, (problem.prior_root @ here.theta)[kept]])
+    jacobian = np.concatenate([found.jacobian[:, kept], problem.prior_root[np.ix_(kept, kept)]])
     (part,) = problem.parts
     task = part.task_at(here.theta).replace(harmonic_amplitude=ABSENT)
     tried = lines_of(part, task, np.asarray(null.power), float(part.target.frequency[-1]))

@@ -82,7 +82,7 @@ def _some(
 ) -> dict[str, Interval]:
     names = list(widening)
     here = Point.of(problem, objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
-    curvature = here.jacobian[0].T @ here.jacobian[0] + np.diag(problem.prior)
+    curvature = here.jacobian[0].T @ here.jacobian[0] + problem.precision
     gain = np.linalg.pinv(curvature, hermitian=True)
     seen_here = [here.quantity(name) for name in names]
     value, slope = (np.repeat([pair[k][0] for pair in seen_here], 2, axis=0) for k in (0, 1))
@@ -205,7 +205,7 @@ def held_step(
     `pull`, how far what is held is from where it is held, in units of how tightly; `rise`, its
     slope.
     """
-    prior = np.diag(problem.prior)
+    prior = problem.precision
     curvature = (
         np.einsum("rki,rkj->rij", seen.jacobian, seen.jacobian)
         + prior
@@ -290,7 +290,7 @@ class Point(NamedTuple):
         found = consequences_of_rows(objective, jax.tree.map(lambda x: np.asarray(x)[rows], seen))
         found = jax.tree.map(lambda x: x[:count], found)
         cost = 0.5 * np.sum(found.residuals**2, axis=1) + 0.5 * np.sum(
-            problem.prior * seen.theta**2, axis=1
+            (seen.theta @ problem.precision) * seen.theta, axis=1
         )
         tables = problem.by_name(found.values), problem.by_name(found.slopes)
         return cls(

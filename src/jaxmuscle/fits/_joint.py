@@ -15,6 +15,7 @@ from jaxmuscle.model._parameters import proper, proper_values, unknown_parameter
 from jaxmuscle.model._rungs import RUNGS, on_rung
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import (
+    DAMPING,
     MASSES,
     FitOptions,
     Plan,
@@ -32,7 +33,7 @@ from jaxmuscle.objective._derived import MEAN
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._scaling import at_force, is_scalable, times_force
 
-from ._ladder import Models
+from ._ladder import Models, first_rung
 from ._perturbed import ANEW, aimed, alike, recordings_of, seen_with
 from ._result import FitResult
 from ._search import search
@@ -99,8 +100,8 @@ def fit_joint(  # noqa: PLR0913 (options of a public call)
       newtons: then all tasks are scaled by one number, to the first of these means, and every
       target that states a mean has a free P_w. Where one target is of a moved insertion, the masses
       are not scaled, and are free in all tasks
-    - `rungs`: how many richer models may be tried where the base model does not describe the data
-      (`on_rung`; all targets get the same one). Not with `tasks`
+    - `rungs`: how many richer models may be tried where a spectrum shows a tremor, or the base
+      model does not describe the data (`on_rung`; all targets get the same one). Not with `tasks`
     - `answer`: as in `fit`
 
     **Returns:** a `FitResult` with a part for each target; a fit that fails is one, too, and says
@@ -141,8 +142,8 @@ def fit_joint(  # noqa: PLR0913 (options of a public call)
         if (found := recordings_of(given, (tasks or {}).get(name)))
     }
 
-    def all_models(loaded: dict[str, Target], options: FitOptions) -> tuple[Plan, Models]:
-        """The fit of the base model, and of the richer ones."""
+    def all_models(loaded: dict[str, Target], options: FitOptions) -> Models:
+        """The base model, and the richer ones."""
         base, means, carried = (
             _models(loaded, tasks or {}, noise, proper_values(fix)),
             mean_force,
@@ -156,7 +157,7 @@ def fit_joint(  # noqa: PLR0913 (options of a public call)
             made = {name: on_rung(task, rung) for name, task in base.items()} if rung else base
             return planned_jointly(made, loaded, options, separate, proportional, means, carried)
 
-        def renewed(muscles: tuple[AbstractTask, ...]) -> tuple[Plan, Models] | None:
+        def renewed(muscles: tuple[AbstractTask, ...]) -> Models | None:
             options.progress(ANEW, 0.0)
             fitted = dict(zip(loaded, muscles, strict=True))
             again = loaded | {name: seen_with(fitted[name], found) for name, found in moved.items()}
@@ -166,11 +167,12 @@ def fit_joint(  # noqa: PLR0913 (options of a public call)
                 else all_models(again, options)
             )
 
-        return plan_at(0), Models(rungs, plan_at, renewed=renewed if moved else None)
+        first = first_rung(list(loaded.values()), 0, rungs)
+        return Models(first, 0, rungs, plan_at, renewed if moved else None)
 
     with told(progress, f"fitting {', '.join(loaded)}") as tell, fitting():
-        plan, models = all_models(loaded, dataclasses.replace(options, progress=tell))
-        result = search(plan, answer, models if rungs else None)
+        models = all_models(loaded, dataclasses.replace(options, progress=tell))
+        result = search(models.plan_at(models.first), answer, models if rungs else None)
     left_out = () if mean_force is not None or not tasks else _far_from_means(result)
     return dataclasses.replace(result, notices=(*result.notices, *left_out))
 
@@ -224,7 +226,7 @@ def planned_jointly(
     names, moved = joint_names(local, tasks, separate), _any_moved(targets)
     known = list(dict.fromkeys(joint for of in names.values() for joint in of.values()))
     _check_known("bounds", bounds, known)
-    _check_known("priors", priors, known)
+    _check_known("priors", priors, [*known, DAMPING])
     plans = {
         name: planned(
             tasks[name],
@@ -234,7 +236,7 @@ def planned_jointly(
                 free=local[name],
                 fix=None,
                 bounds=_own(bounds, names[name]),
-                priors=_own(priors, names[name]),
+                priors=_own(priors, names[name] | {DAMPING: DAMPING}),
                 mean_force=means.get(name),
             ),
             moved=moved,

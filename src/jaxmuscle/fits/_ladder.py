@@ -9,23 +9,23 @@ from jaxtyping import Float
 
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
-from jaxmuscle.model._noise import NoiseSum
-from jaxmuscle.model._parameters import HARMONIC, default
+from jaxmuscle.data._target import Target
+from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.model._resonant_noise import ResonantNoise
-from jaxmuscle.model._rungs import QUIET, rung_name
+from jaxmuscle.model._rungs import QUIET, RICHER, rung_name
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, Plan
 from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import log_marginal, measured_bins
-from jaxmuscle.objective._starts import continued, starting_points
+from jaxmuscle.objective._starts import continued, kinds_of_starts, starting_points
 
 from ._adequacy import ADEQUATE, Endpoint, rows_of
 from ._checks import Stage
-from ._harmonic_evidence import SIGNIFICANT, p_of_line_left_out, p_value
+from ._harmonic_evidence import SIGNIFICANT, p_of_line_left_out
+from ._peaks import find_slower_peak, find_tremor
 
 STARTS = 32
 ALIKE = 2.0
-TREMOR = 2  # the rung whose rhythm is no line
 DESCENDED = 0.6  # a fit's progress when its descents have ended
 
 
@@ -69,45 +69,50 @@ Descend = Callable[[Plan, np.ndarray, list[Stage]], Any]
 
 
 class Models(NamedTuple):
-    """The models that may be tried: up to which rung, how each is fitted, and from which rung on.
+    """The models that may be tried: the first, from which rung up to which, and how each is fitted.
 
-    `base` and `plan_of`, of one target: the task of the base model, and how another is fitted.
     `renewed`: of moved records, what the muscles that were fitted make of their targets; None where
     that says nothing new.
     """
 
+    first: int
+    lowest: int
     top: int
     plan_at: Callable[[int], Plan]
-    lowest: int = 0
-    base: AbstractTask | None = None
-    plan_of: Callable[[AbstractTask], Plan] | None = None
-    renewed: "Callable[[tuple[AbstractTask, ...]], tuple[Plan, Models] | None] | None" = None
+    renewed: "Callable[[tuple[AbstractTask, ...]], Models | None] | None" = None
 
 
-def climb(
-    first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed], None]
-) -> tuple[Rung, ...]:
-    """Fit the first model and the next ones until one is adequate; `keep` gets each that is the
-    best so far.
+def first_rung(targets: list[Target], lowest: int, top: int) -> int:
+    """The model that the spectra ask for: one with a resonance where one of them shows a tremor,
+    with two where that one shows a slower peak, too, else the lowest."""
+    trembling = [target for target in targets if find_tremor(target) is not None]
+    asked = lowest
+    if trembling:
+        slower = any(find_slower_peak(target) is not None for target in trembling)
+        asked = RICHER["two resonances" if slower else "resonance"]
+    return min(asked, top)
 
-    The best has the lowest AIC. A rung that gains nothing is left out, and the next one is tried.
+
+def climb(models: Models, descend: Descend, keep: Callable[[Climbed], None]) -> tuple[Rung, ...]:
+    """Fit one model after the other until one describes the data; `keep` gets each that is the best
+    so far.
+
+    The best has the lowest AIC: a model that gains nothing is left out, and the next one is tried.
     An adequate model is no end in two cases, and a further one is then taken if its AIC is lower by
-    more than 2: noise alone beside which the spectrum shows a significant line, for which the
-    harmonic is tried; and a significant harmonic, for which the tremor is.
+    more than 2. A resonance for the tremor that came out narrower than a bin may be a line, for
+    which the models with a harmonic are tried. And so is the first of these beside noise alone, if
+    the spectrum shows a significant line.
     """
     tried: list[Climbed] = []
     best: Climbed | None = None
-    due: int | None = None  # the model to be tried although the best one describes the data
-    numbers = range(models.lowest, models.top + 1)
-    for place, number in enumerate(numbers):
-        described = best is not None and best.rung.p >= ADEQUATE
-        if described and number != due:
-            continue
-        plan = models.plan_at(number) if number > models.lowest else first
-        points = starting_points(plan.problem, plan.starts) if best is None else _warm(plan, best)
-        plan = plan._replace(settings=plan.settings | {"starts": len(points)})
+    waiting = list(range(models.first, models.top + 1))
+    while waiting:
+        number = waiting.pop(0)
+        plan = models.plan_at(number)
+        points, plan = _begin(plan, best)
         stages: list[Stage] = []
-        begin, share = place * DESCENDED / len(numbers), DESCENDED / len(numbers)
+        share = DESCENDED / (models.top - models.lowest + 1)
+        begin = len(tried) * share
         telling = _telling(
             plan, f"model {number} (of models 0 to {models.top})", begin, begin + share
         )
@@ -118,28 +123,30 @@ def climb(
         ended = Endpoint.of(plan.problem, stages[-1])
         found = Climbed(plan, stages, known, ended, rung_of(ended, number))
         tried.append(found)
+        described = best is not None and best.rung.p >= ADEQUATE
         if best is None or found.rung.aic < best.rung.aic - ALIKE * described:
             best = found
             keep(found)
-        if best.rung.p >= ADEQUATE:
-            due = _due(best, number, models)
-            if due is None:
-                break
-    return tuple(each.rung._replace(chosen=each is best) for each in tried)
+        if number == models.first >= RICHER["resonance"] and is_narrow(found):
+            waiting = [*range(max(models.lowest, 0), number), *waiting]
+        elif best.rung.p >= ADEQUATE and not (number == QUIET and _shows_line(best)):
+            break
+    in_order = sorted(tried, key=lambda each: each.rung.number)
+    return tuple(each.rung._replace(chosen=each is best) for each in in_order)
 
 
-def _due(best: Climbed, number: int, models: Models) -> int | None:
-    """Which model is tried after this one, where the best one describes the data; of several
-    targets none."""
-    if models.base is None:
-        return None
-    if number == QUIET:
-        line = (
-            float(models.base.harmonic.amplitude) > 0
-            and p_of_line_left_out(best.ended) < SIGNIFICANT
-        )
-        return number + 1 if line else None
-    return TREMOR if number < TREMOR <= models.top and _has_line(best) else None
+def is_narrow(found: Climbed) -> bool:
+    """Whether a resonance of the fitted model is narrower than a bin."""
+    problem = found.plan.problem
+    return any(
+        isinstance(noise, ResonantNoise) and float(noise.width) < part.target.settings.resolution
+        for part, task in zip(problem.parts, problem.tasks_at(found.ended.seen.theta), strict=True)
+        for noise in task.noise.components
+    )
+
+
+def _shows_line(quiet: Climbed) -> bool:
+    return p_of_line_left_out(quiet.ended) < SIGNIFICANT
 
 
 def _telling(plan: Plan, which: str, begin: float, end: float) -> Plan:
@@ -153,22 +160,20 @@ def _telling(plan: Plan, which: str, begin: float, end: float) -> Plan:
     return plan._replace(problem=dataclasses.replace(plan.problem, tell=own))
 
 
-def _has_line(found: Climbed) -> bool:
-    """Whether the harmonic of a fit is significant."""
-    problem = found.plan.problem
-    if not set(HARMONIC) <= set(problem.coordinates.names):
-        return False
-    return p_value(problem, problem.linear(), found.stages[-1].minima) < SIGNIFICANT
-
-
-def _warm(plan: Plan, best: Climbed) -> Float[np.ndarray, "starts free"]:
-    """Starts of a richer model: for the most part what it shares with the best one begins where
-    that ended."""
-    before, known = best.plan.problem, dict[str, float]()
-    for part, task in zip(before.parts, before.tasks_at(best.ended.seen.theta), strict=True):
-        for column, name in zip(part.columns, part.coordinates.names, strict=True):
-            known.setdefault(before.coordinates.names[column], float(task[name]))
-    return continued(plan.problem, _fewer(plan.starts), known)
+def _begin(plan: Plan, best: Climbed | None) -> tuple[Float[np.ndarray, "starts free"], Plan]:
+    """Starts of a model, and its plan with these; of a richer one for the most part where what it
+    shares with the best one ended."""
+    problem, count = plan.problem, plan.starts if best is None else _fewer(plan.starts)
+    if best is None:
+        points = starting_points(problem, count)
+    else:
+        before, known = best.plan.problem, dict[str, float]()
+        for part, task in zip(before.parts, before.tasks_at(best.ended.seen.theta), strict=True):
+            for column, name in zip(part.columns, part.coordinates.names, strict=True):
+                known.setdefault(before.coordinates.names[column], float(task[name]))
+        points = continued(problem, count, known)
+    kinds = kinds_of_starts(problem, count, continued=best is not None)
+    return points, plan._replace(settings=plan.settings | {"starts": count}, kinds=kinds)
 
 
 def _fewer(starts: int) -> int:
@@ -192,7 +197,7 @@ def criterion(ended: Endpoint) -> tuple[float, float]:
     """AIC of the likelihood where a fit ended, and the effective number of parameters."""
     found, precision = ended.found, np.linalg.pinv(ended.scatter, rcond=1e-9, hermitian=True)
     parameters = effective_parameters(
-        found.jacobian.T @ precision @ found.jacobian, ended.problem.prior
+        found.jacobian.T @ precision @ found.jacobian, ended.problem.precision
     )
     height = 0.0
     for part, moments, rows in zip(
@@ -211,53 +216,3 @@ def criterion(ended: Endpoint) -> tuple[float, float]:
 @kept
 def _height(law: Any, power: Any, line: Any) -> Any:
     return log_marginal(law, power, line)
-
-
-def line_or_resonance(
-    plan: Plan, fitted: AbstractTask, ladder: tuple[Rung, ...], models: Models, descend: Descend
-) -> tuple[str, ...]:
-    """Whether the rhythm that was found is a line or a narrow resonance, in a sentence, where that
-    is the question.
-
-    It is where a harmonic is significant (`climb` has tried the tremor then), and where a resonance
-    is narrower than a bin.
-    """
-    assert models.plan_of is not None  # of one target
-    chosen = next(rung for rung in ladder if rung.chosen)
-    (part,) = plan.problem.parts
-    task, resolution = part.task, part.target.settings.resolution
-    if chosen.number < 2:
-        tremor = [rung.aic for rung in ladder if rung.number == 2]
-        return (told_apart(chosen.aic, tremor[0]),) if tremor else ()
-    parts = task.noise.components
-    for i, found in enumerate(fitted.noise.components):
-        if isinstance(found, ResonantNoise) and float(found.width) < resolution:
-            others = parts[:i] + parts[i + 1 :]
-            rest = task.with_parts(noise=NoiseSum(others))
-            line = {
-                "harmonic_amplitude": default("harmonic_amplitude"),
-                "harmonic_frequency": float(found.frequency),
-            }
-            aic = _aic_of(models.plan_of(rest.replace(**line)), descend)
-            return () if aic is None else (told_apart(aic, chosen.aic),)
-    return ()
-
-
-def _aic_of(plan: Plan, descend: Descend) -> float | None:
-    """What a model reaches; None if no start has a finite spectrum."""
-    stages: list[Stage] = []
-    plan = _telling(plan, "a line instead of the resonance", 0.95, 1.0)
-    if descend(plan, starting_points(plan.problem, _fewer(plan.starts)), stages) is None:
-        return None
-    return criterion(Endpoint.of(plan.problem, stages[-1]))[0]
-
-
-def told_apart(line: float, resonance: float) -> str:
-    """A line against a resonance by their AIC, in a sentence."""
-    said = f"a line of zero width (AIC {line:.1f}) and a resonance (AIC {resonance:.1f})"
-    if abs(line - resonance) <= ALIKE:
-        return (
-            f"{said} cannot be told apart: whether the rhythm is regular or a tremor remains open;"
-            " record longer"
-        )
-    return f"{said}: the data prefer the {'line' if line < resonance else 'resonance'}"

@@ -139,7 +139,7 @@ class Problem(Shown):
         stretch = jnp.where(
             bounded, width + jax.nn.log_sigmoid(theta) + jax.nn.log_sigmoid(-theta), 0.0
         )
-        return jnp.sum(stretch) - 0.5 * jnp.sum(self.objective.prior * scaled**2)
+        return jnp.sum(stretch) - 0.5 * jnp.sum((self.objective.prior_root @ scaled) ** 2)
 
     def log_density(self, theta: Theta) -> Scalar:
         """Log density of the posterior as one of θ, `log_likelihood + log_prior`: what a sampler

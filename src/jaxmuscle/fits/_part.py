@@ -17,6 +17,7 @@ from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._derived import MEAN
+from jaxmuscle.objective._starts import SPREAD
 
 from ._fit_file import EstimateTable, PartTable, check_lengths
 
@@ -111,13 +112,15 @@ class Start(eqx.Module):
 
     `success`: whether its last step lowered the cost by less than a thousandth of it. `values`,
     where the free parameters ended, in the order of `settings["free"]`; empty where that is not
-    finite.
+    finite. `kind`, how it began: "peak", at a peak of the spectrum; "response", at the measured
+    one; "other model", where that one ended; "own values" of the task; else "spread".
     """
 
     cost: float | None
     success: bool
     steps: int
     values: tuple[float, ...] = ()
+    kind: str = SPREAD
 
 
 class FittedPart(eqx.Module):

@@ -78,7 +78,7 @@ def refit_of(
 ) -> Refit:
     """Lines of every frequency and strength in place of the fitted one, where a fit would have
     found them."""
-    names, prior = problem.coordinates.names, np.sqrt(problem.prior)
+    names, prior = problem.coordinates.names, problem.prior_root
     free = tuple(names.index(n) for n in HARMONIC if n in names)
     moments, slopes, own = seen.moments[0], seen.slopes[0], objective.parts[0]
     jacobian, turn = _narrowed(objective, found.jacobian)
@@ -86,12 +86,12 @@ def refit_of(
     power, line = np.asarray(moments.power), np.asarray(moments.line)
     alone = len(problem.parts) == 1 and len(free) == 2 and problem.residual == "log"
     if not (alone and np.all(power > line) and np.any(line > 0)):
-        taken = taken_up(np.concatenate([found.jacobian, np.diag(prior)]))[None]
+        taken = taken_up(np.concatenate([found.jacobian, prior]))[None]
         return Refit(
             np.zeros((1, taken.shape[1])),
             taken,
             np.zeros(1),
-            prior * seen.theta,
+            prior @ seen.theta,
             np.zeros(1),
             (),
             np.asarray(block_diag(turn, np.eye(len(prior)))),
@@ -124,11 +124,11 @@ def refit_of(
         jacobian[:, bins] = (0.5 * moved - slopes.mean[kept] / float(moments.mean)) / error
     # Of two lines of one frequency the mean square goes with the squared amplitude.
     louder = 0.5 * (np.log(square / held) - np.log(tried.gain / tried.gain[-1])) / sd[a]
-    change[:, -1] = -prior[a] * louder
-    jacobian[:, count:-1] = np.diag(prior[kept])
-    jacobian[:, -1] = -0.5 * prior[a] * level / sd[a]
+    change[:, -1] = -prior[a, a] * louder
+    jacobian[:, count:-1] = prior[np.ix_(kept, kept)]
+    jacobian[:, -1] = -0.5 * prior[a, a] * level / sd[a]
     theta = seen.theta[f] + np.log(frequency / here) / sd[f]
-    rows = np.append(prior[kept] * seen.theta[kept], prior[a] * seen.theta[a])
+    rows = np.append((prior @ seen.theta)[kept], prior[a, a] * seen.theta[a])
     return Refit(
         change,
         taken_up(jacobian),

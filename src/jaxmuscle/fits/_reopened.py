@@ -10,7 +10,7 @@ from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS, proper_names, proper_values
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._arguments import FitOptions, base_of, planned, target_of
+from jaxmuscle.objective._arguments import DAMPING, FitOptions, base_of, planned, target_of
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.response._second_order import warn_beyond
@@ -64,7 +64,11 @@ def reopened(
         )
         for n in names
     }
+    sds[DAMPING] = settings.get("damping_ratio_sd")
     for name, given in priors.items():
+        if name == DAMPING:
+            sds[name] = given
+            continue
         if name not in names:
             raise ValueError(f"priors: {name} is not free; free are {', '.join(names)}")
         centres[name], sds[name] = given if isinstance(given, tuple) else (centres[name], given)

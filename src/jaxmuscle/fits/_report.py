@@ -18,6 +18,7 @@ from jaxmuscle.objective._covariance import Identifiability, common_scales
 from jaxmuscle.objective._derived import jackknife, observed
 from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem, Part
+from jaxmuscle.objective._starts import PEAK
 from jaxmuscle.response._expected import Moments, check_power, expected_moments
 from jaxmuscle.response._linearised import settled
 from jaxmuscle.response._second_order import negative_coefficients, second_order
@@ -44,6 +45,7 @@ from ._checks import (
 from ._harmonic_evidence import harmonic_test
 from ._ladder import Rung
 from ._part import FittedPart, Start
+from ._peaks import find_unseen
 from ._result import FitResult
 from ._tables import (
     correlation_table,
@@ -98,9 +100,13 @@ def report_fit(
     problem, final = plan.problem, stages[-1].minima
     first = stages[0].minima
     ends = problem.coordinates.values_of(np.asarray(problem.coordinates.theta(np.asarray(first.s))))
+    # further ones have a harmonic at the peaks
+    kinds = (*plan.kinds, *[PEAK] * (len(ends) - len(plan.kinds)))
     starts = tuple(
-        Start(float(c) if np.isfinite(c) else None, bool(ok), int(n), _six_digits(end))
-        for c, ok, n, end in zip(first.cost, first.settled, first.steps, ends, strict=True)
+        Start(float(c) if np.isfinite(c) else None, bool(ok), int(n), _six_digits(end), kind)
+        for c, ok, n, end, kind in zip(
+            first.cost, first.settled, first.steps, ends, kinds, strict=True
+        )
     )
     common = {
         "method": problem.method,
@@ -146,7 +152,14 @@ def report_fit(
     judgement, covariance = ended.adequacy, ended.covariance
     known = Identifiability.of_covariance(covariance)
     success, message = convergence(
-        final, found.residuals, found.jacobian, problem.prior, theta, known, starts, plan.max_steps
+        final,
+        found.residuals,
+        found.jacobian,
+        problem.precision,
+        theta,
+        known,
+        starts,
+        plan.max_steps,
     )
     if interrupted:
         success, message = (
@@ -171,7 +184,8 @@ def report_fit(
     if share > UNSETTLED:
         moved |= {n for n in parameters | derived if base_of(n).startswith("harmonic_")}
         other += (may_be_elsewhere(share),)
-    moved |= too_curved(problem, derived, known)
+    unseen, why = find_unseen(problem, parameters | derived)
+    moved |= too_curved(problem, derived, known) | unseen
     parameters, derived = (
         widened(without_errors(moved, table), ended.widening) for table in (parameters, derived)
     )
@@ -211,6 +225,7 @@ def report_fit(
             *notices,
             *ended.judged[1],
             *other,
+            *why,
             *twitch_notices(derived),
             *mass_notices(problem.coordinates, theta),
             *reach_notices(derived, parts),
@@ -307,11 +322,12 @@ def _parts(
                 plan.problem.method,
             ),
             *further_notices(further),
+            *ended.signals[i].notices,
             *negative_coefficients(task),
         ]
         notices += own if len(tasks) == 1 else [f"{part.name}: {notice}" for notice in own]
         parts[part.name or target.name] = FittedPart(
-            target=target.with_measures(),
+            target=ended.signals[i].widened(target.with_measures()),
             task=task,
             chi2_per_bin=(
                 float(np.sum(residual**2) / (len(residual) - 1))

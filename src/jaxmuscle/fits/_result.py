@@ -431,7 +431,7 @@ def _from_table(table: dict[str, Any], file: str) -> FitResult:
         undetermined=tuple(said.undetermined),
         ladder=tuple(Rung(**msgspec.structs.asdict(rung)) for rung in said.ladder),
         singular_values=from_nulls(said.singular_values),
-        starts=tuple(Start(s.cost, s.success, s.steps, s.values) for s in said.starts),
+        starts=tuple(Start(s.cost, s.success, s.steps, s.values, s.kind) for s in said.starts),
         profile=(
             None
             if said.profile is None

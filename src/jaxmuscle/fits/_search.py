@@ -19,13 +19,13 @@ from jaxmuscle.objective._consequences import BATCH
 from jaxmuscle.objective._least_squares import Minima, least_squares
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.objective._residuals import Residuals
-from jaxmuscle.objective._starts import contenders, recombined, starting_points
+from jaxmuscle.objective._starts import contenders, kinds_of_starts, recombined, starting_points
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
 from ._adequacy import Endpoint
 from ._checks import AMBIGUOUS, Stage, controlled_moments, seen_best
-from ._ladder import Climbed, Models, Rung, climb, line_or_resonance, rung_of
+from ._ladder import Climbed, Models, Rung, climb, rung_of
 from ._report import UNCHECKED, report_fit
 from ._result import FitResult
 
@@ -62,73 +62,85 @@ class FitInterrupted(KeyboardInterrupt):
             return self.report()
 
 
-def search(  # noqa: C901, PLR0915 (will soon be rewritten)
+@dataclasses.dataclass
+class _Search:
+    """Where a search stands: the plan of the best model so far, its stages, what is known of the
+    scatter of its data, and the models that were tried. It changes as the search goes on, so that
+    Ctrl-C finds what was reached."""
+
+    plan: Plan
+    stages: list[Stage] = dataclasses.field(default_factory=list)
+    known: "Known | None" = None
+    ladder: tuple[Rung, ...] = ()
+
+    def keep(self, found: Climbed) -> None:
+        """Go on from this model."""
+        self.plan, self.known = found.plan, found.known
+        self.stages[:] = found.stages
+
+    def find(self, models: Models | None) -> None:
+        """The best minimum of one model, or of the best of several."""
+        problem = self.plan.problem
+        if models is not None:
+            self.climb(models)
+            return
+        points = starting_points(problem, self.plan.starts)
+        kinds = kinds_of_starts(problem, self.plan.starts)
+        self.plan = self.plan._replace(kinds=kinds)
+        if problem.method == "linear":
+            self.known = _descended(self.plan, points, self.stages)
+        else:
+            _montecarlo(self.plan, points, self.stages)
+
+    def climb(self, models: Models) -> None:
+        """One model after the other; of moved records again with the targets that the muscle of
+        the chosen model sees."""
+        self.ladder = climb(models, _descended, self.keep)
+        for _ in range(RENEWALS):
+            richer = any(rung.chosen and rung.number > 0 for rung in self.ladder)
+            if not richer or models.renewed is None:
+                return
+            anew = models.renewed(_reached(self.plan, self.stages))
+            # until they have been tried, what was found before stays
+            better: list[Climbed] = []
+            tried = () if anew is None else climb(anew, _descended, better.append)
+            if anew is None or not better:
+                return
+            self.ladder, models = tried, anew
+            self.keep(better[-1])
+
+
+def search(
     plan: Plan, answer: Callable[[FitResult], None] | None = None, models: Models | None = None
 ) -> FitResult:
     """From the starting points to a result; Ctrl-C ends it with what had been reached.
 
-    `answer` gets the result before its checks; Ctrl-C in these keeps it. Of richer `models` one
+    `answer` gets the result before its checks; Ctrl-C in these keeps it. Of several `models` one
     after the other is tried until one describes the data.
     """
-    problem = plan.problem
-    stages: list[Stage] = []
-    ladder: tuple[Rung, ...] = ()
-    interrupted = False
-
-    def keep(found: Climbed) -> None:
-        nonlocal plan, known
-        plan, known = found.plan, found.known
-        stages[:] = found.stages
-
-    known: Known | None = None
+    run = _Search(plan)
     try:
-        problem.tell("compiling, which the first time takes longest", 0.0)
-        if problem.method != "linear":
-            _montecarlo(plan, starting_points(problem, plan.starts), stages)
-        elif models is None:
-            known = _descended(plan, starting_points(problem, plan.starts), stages)
-        else:
-            ladder = climb(plan, models, _descended, keep)
-            for _ in range(RENEWALS):
-                richer = any(rung.chosen and rung.number > 0 for rung in ladder)
-                anew = (
-                    models.renewed(_reached(plan, stages))
-                    if richer and models.renewed is not None
-                    else None
-                )
-                if anew is None:
-                    break
-                # until they have been tried, what was found before stays
-                better: list[Climbed] = []
-                tried = climb(*anew, _descended, better.append)
-                if not better:
-                    break
-                ladder, models = tried, anew[1]
-                keep(better[-1])
-        if known is not None:
-            _polished(plan, known, stages)
+        plan.problem.tell("compiling, which the first time takes longest", 0.0)
+        run.find(models)
+        if run.known is not None:
+            _polished(run.plan, run.known, run.stages)
     except KeyboardInterrupt:
-        interrupted = True
-    if not stages:
-        raise KeyboardInterrupt("fit interrupted before its first step")
-    if interrupted:
-        raise _stopped(plan, stages, ladder, interrupted=True)
-    problem, ended = plan.problem, None
+        if not run.stages:
+            raise KeyboardInterrupt("fit interrupted before its first step") from None
+        raise _stopped(run.plan, run.stages, run.ladder, interrupted=True) from None
+    plan, problem, ended = run.plan, run.plan.problem, None
     try:
-        ended = Endpoint.of(problem, stages[-1])
+        ended = Endpoint.of(problem, run.stages[-1])
         if answer is not None and plan.check_seeds:
-            answer(_checked_later(_unchecked(plan, stages, ladder, ended)))
+            answer(_checked_later(_unchecked(plan, run.stages, run.ladder, ended)))
         problem.tell(
             "checking with new simulations" if plan.check_seeds else "computing the errors", 0.8
         )
-        result = report_fit(plan, stages, ladder, ended=ended)
+        result = report_fit(plan, run.stages, run.ladder, ended=ended)
         if answer is not None and not plan.check_seeds:
             answer(result)
-        if models is not None and models.plan_of is not None and result.success:
-            said = line_or_resonance(plan, result.task, ladder, models, _descended)
-            result = dataclasses.replace(result, notices=(*result.notices, *said))
     except KeyboardInterrupt:
-        raise _stopped(plan, stages, ladder, ended) from None
+        raise _stopped(plan, run.stages, run.ladder, ended) from None
     problem.tell("done", 1.0)
     return result
 
@@ -182,6 +194,7 @@ def search_together(
     fluctuate is what the model says.
     """
     problems = [plan.problem for plan in plans]
+    plans = [p._replace(kinds=kinds_of_starts(p.problem, p.starts)) for p in plans]
     points = [starting_points(plan.problem, plan.starts, alone=not replicates) for plan in plans]
     objectives = [problem.linear() for problem in problems]
     first = _together(objectives, points, plans[0].max_steps, "trying starts", tell, (0.0, 0.7))

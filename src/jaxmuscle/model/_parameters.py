@@ -206,6 +206,7 @@ PARAMETERS: dict[str, Parameter] = {
             0.005,
             "resonance of the drive (a tremor), a fraction of P_w",
             _HUMAN,
+            sd=2.0,
         ),
         _row(
             "resonance_frequency",
@@ -236,6 +237,7 @@ PARAMETERS: dict[str, Parameter] = {
             0.005,
             "a second resonance of the drive, a fraction of P_w",
             _HUMAN,
+            sd=2.0,
         ),
         _row(
             "resonance_2_frequency",

@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jaxmuscle._common.arguments import count, positive
 from jaxmuscle._common.arrays import as_numbers, with_nulls
@@ -49,10 +50,17 @@ RESIDUALS = ("log", "linear", "cumulative")
 METHODS = ("linear", "montecarlo")
 MOST = 10**9  # of starts, seeds and steps: what is more is a slip
 DT = 2.5e-3
-# With an activation stiffness and damping stay nearer to their defaults: no spectrum determines
-# them, and an underdamped muscle, which swings at 8 Hz, would pass for tremor.
 COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
-NARROW = 0.5
+# of the prior of ln ζ. Small movements of active human muscle, twitch and tissue together, follow a
+# second-order response with two real time constants, 50 ms each (Zahalak & Heyman 1979,
+# doi:10.1115/1.3426220): nothing in it swings.
+DAMPING = "damping_ratio"
+DAMPING_SD = 0.5
+# Hz, in which a fit holds resonances that begin there: the one that is called tremor, of force and
+# of what moves, and the slower one
+TREMOR = {"force": (6.0, 14.0)}
+MOVING = (3.0, 20.0)
+SLOWER = (0.5, 6.0)
 # free where the insertion moves: a perturbation tells m_z, and m_w widens the errors
 MASSES = ("m_w", "m_z")
 
@@ -244,7 +252,7 @@ def at_mean(
 
 
 class Plan(NamedTuple):
-    """A fit to be done."""
+    """A fit to be done; `kinds`, how each of its starts was chosen, where they are known."""
 
     problem: FitProblem
     starts: int
@@ -252,6 +260,7 @@ class Plan(NamedTuple):
     check_seeds: int
     settings: dict
     seed: int | None
+    kinds: tuple[str, ...] = ()
 
 
 def planned(
@@ -268,6 +277,7 @@ def planned(
         dict(options.priors or {}),
         dict(options.fix or {}),
     )
+    damping = priors.pop(DAMPING, DAMPING_SD)
     task = as_numbers(task.with_parts(settings=target.settings).replace(**fix))
     if "acceleration" in (task.quantity, target.quantity):
         check_quantity(
@@ -311,10 +321,11 @@ def planned(
     if options.method == "montecarlo" and counts["seeds"] < 1:
         raise ValueError("seeds = 0: a Monte Carlo fit needs at least one")
     usual = {n: PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0 for n in names}
-    # else a muscle could swing as a tremor does; a response tells that apart
-    if task.activation is not None and not moved:
-        usual |= {n: NARROW for n in COEFFICIENTS if n in names}
     sds = {n: priors.get(n, usual[n]) for n in names}
+    tremor = TREMOR.get(task.quantity, MOVING)
+    for name, (low, high) in (("resonance_frequency", tremor), ("resonance_2_frequency", SLOWER)):
+        if name in names and low < float(task[name]) < high:
+            bounds.setdefault(name, (low, high))
     coordinates = Coordinates.of(
         {n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()}
     )
@@ -334,6 +345,8 @@ def planned(
         options.progress,
         options.optimiser,
         options.draws,
+        # else a muscle could swing as a tremor does; a response tells that apart
+        damping_row(task, coordinates, None if moved or task.activation is None else damping),
     )
     settings = {
         **settings_of(problem, bounds),
@@ -343,6 +356,7 @@ def planned(
         "increments": options.increments,
         "coefficient_of_variation": variation is not None,
         "mean_force": None if mean is None else list(mean),
+        "damping_ratio_sd": damping if problem.damping else None,
         "carried": options.carried,
         "spectrum": target.settings.to_dict(),
         "steps_per_sample": problem.steps_per_sample,
@@ -352,6 +366,30 @@ def planned(
     return Plan(
         problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed
     )
+
+
+def damping_row(
+    task: AbstractTask, coordinates: Coordinates, sd: float | None
+) -> tuple[Float[np.ndarray, " free"], ...]:
+    """How many of its standard deviations the damping ratio of the active mass changes with each θ.
+
+        ζ = (C_w0 + C_z0) / (2 √((K_w0 + K_z0) m_w)),    row · θ = (ln ζ - ln ζ₀) / sd
+
+    to first order about the task's own ζ₀ (2.3 by default). Nothing where `sd` is None, of a muscle
+    that is not the paper's, and where none of these parameters is free.
+    """
+    if sd is None or not isinstance(task.muscle, Muscle):
+        return ()
+    k_w, k_z, c_w, c_z = (float(value) for value in task.muscle.base())
+    slopes = {
+        "c_w": c_w / (c_w + c_z),
+        "c_z": c_z / (c_w + c_z),
+        "k_w": -0.5 * k_w / (k_w + k_z),
+        "k_z": -0.5 * k_z / (k_w + k_z),
+        "m_w": -0.5,
+    }
+    row = np.array([slopes.get(name, 0.0) for name in coordinates.names]) * coordinates.sd / sd
+    return (row,) if np.any(row) else ()
 
 
 def _check_mean(

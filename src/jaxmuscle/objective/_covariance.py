@@ -79,7 +79,7 @@ def identifiability(jacobian: Float[np.ndarray, "residuals parameters"]) -> Iden
 def parameter_covariance(
     jacobian: Float[np.ndarray, "residuals parameters"],
     residual_covariance: Float[np.ndarray, "residuals residuals"],
-    prior_precision: Float[np.ndarray, " parameters"],
+    prior_precision: Float[np.ndarray, "parameters parameters"],
 ) -> Float[np.ndarray, "parameters parameters"]:
     """Covariance `G (Jᵀ Σ J + Λ) G`, G = (Jᵀ J + Λ)⁻¹, of a penalised least-squares estimate about
     the truth.
@@ -87,14 +87,13 @@ def parameter_covariance(
     Scatter of the data plus the pull of the prior, averaged over truths drawn from it. Where the
     data determine a direction it is `J⁺ Σ J⁺ᵀ`; where they say nothing it is the prior.
     """
-    prior = np.diag(prior_precision)
-    gain = np.linalg.pinv(jacobian.T @ jacobian + prior, hermitian=True)
-    return gain @ (jacobian.T @ residual_covariance @ jacobian + prior) @ gain
+    gain = np.linalg.pinv(jacobian.T @ jacobian + prior_precision, hermitian=True)
+    return gain @ (jacobian.T @ residual_covariance @ jacobian + prior_precision) @ gain
 
 
 def effective_parameters(
     information: Float[np.ndarray, "parameters parameters"],
-    prior_precision: Float[np.ndarray, " parameters"],
+    prior_precision: Float[np.ndarray, "parameters parameters"],
 ) -> float:
     """`p = tr(F (F + Λ)⁻¹)`, F the Fisher information of the data: how many parameters they
     determine.
@@ -102,9 +101,7 @@ def effective_parameters(
     Murata, Yoshizawa & Amari 1994, doi:10.1109/72.329683.
     """
     return float(
-        np.trace(
-            information @ np.linalg.pinv(information + np.diag(prior_precision), hermitian=True)
-        )
+        np.trace(information @ np.linalg.pinv(information + prior_precision, hermitian=True))
     )
 
 

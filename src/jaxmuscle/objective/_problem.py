@@ -146,8 +146,10 @@ class FitProblem:
     """What a fit is about, its arguments checked: one target, or several of one person with what
     they share.
 
-    `control`: whether all tasks have a linear response; `optimiser`, which makes the steps (None:
-    Levenberg-Marquardt); `draws`, which random numbers what is simulated for expectations takes.
+    `prior` is the precision of every θ by itself (1, or 0 where it is flat); `damping`, a row for
+    each muscle whose damping ratio has a prior, too (`damping_row`). `control`: whether all tasks
+    have a linear response; `optimiser`, which makes the steps (None: Levenberg-Marquardt);
+    `draws`, which random numbers what is simulated for expectations takes.
     """
 
     parts: tuple[Part, ...]
@@ -162,6 +164,18 @@ class FitProblem:
     tell: Callable[[str, float], None]
     optimiser: Any = None
     draws: Draws = Draws()  # noqa: RUF009
+    damping: tuple[Float[np.ndarray, " free"], ...] = ()
+
+    @property
+    def precision(self) -> Float[np.ndarray, "free free"]:
+        """That of the prior of all θ, Λ: its density is exp(-½ θᵀ Λ θ)."""
+        return np.diag(self.prior) + sum(np.outer(row, row) for row in self.damping)
+
+    @property
+    def prior_root(self) -> Float[np.ndarray, "free free"]:
+        """The symmetric root of the precision: the residuals of the prior are this times θ."""
+        values, vectors = np.linalg.eigh(self.precision)
+        return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
     @classmethod
     def shared(
@@ -192,9 +206,19 @@ class FitProblem:
             for t, p in problems.items()
         )
         prior = np.array([problem.prior[i] for problem, i in places.values()])
+        rows: dict[tuple[int, ...], np.ndarray] = {}  # a muscle that targets share counts once
+        for problem, part in zip(problems.values(), parts, strict=True):
+            for own in problem.damping:
+                row = np.zeros(len(places))
+                row[list(part.columns)] = own
+                rows.setdefault(tuple(map(int, np.flatnonzero(row))), row)
         first = next(iter(problems.values()))
         return dataclasses.replace(
-            first, parts=parts, coordinates=Coordinates(tuple(places), *fields), prior=prior
+            first,
+            parts=parts,
+            coordinates=Coordinates(tuple(places), *fields),
+            prior=prior,
+            damping=tuple(rows.values()),
         )
 
     @property
@@ -277,7 +301,7 @@ class FitProblem:
         )
 
     def _residuals(self, parts: Any) -> Residuals:
-        free = as_arrays({"prior": self.prior, "moving": np.ones(len(self.prior))})
+        free = as_arrays({"prior_root": self.prior_root, "moving": np.ones(len(self.prior))})
         return Residuals(
             tuple(parts),
             self.coordinates,

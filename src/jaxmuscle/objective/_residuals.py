@@ -105,7 +105,7 @@ class Residuals(eqx.Module):
 
     parts: tuple[PartResiduals, ...]
     coordinates: Coordinates
-    prior: Float[Array | np.ndarray, " free"]
+    prior_root: Float[Array | np.ndarray, "free free"]
     moving: Float[Array | np.ndarray, " free"]
     columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     optimiser: Any = eqx.field(static=True, default=None)
@@ -141,7 +141,7 @@ class Residuals(eqx.Module):
         self, theta: Float[Array, " free"], moments: tuple[Moments, ...], data: tuple[Data, ...]
     ) -> Float[Array, " all"]:
         """Data residuals of the moments at θ, then those of the prior, which counts once."""
-        return jnp.concatenate([self.data_residuals(moments, data), jnp.sqrt(self.prior) * theta])
+        return jnp.concatenate([self.data_residuals(moments, data), self.prior_root @ theta])
 
     def own(
         self, values: Float[Array | np.ndarray, "*rows free"], i: int

@@ -95,14 +95,14 @@ def _local(
 def maximise(
     likelihood: Likelihood,
     theta: Float[np.ndarray, "rows free"],
-    precision: Float[np.ndarray, " free"],
+    precision: Float[np.ndarray, "free free"],
     *,
     bins: AllBins | None = None,
     moving: Float[np.ndarray, "rows free"] | None = None,
     pin: Pin | None = None,
     max_steps: int = STEPS,
 ) -> Maximum:
-    """Minimise `-ln L(θ, u) + ½ Σ precision θ²` from every row, u the offsets; `moving` is 0 where
+    """Minimise `-ln L(θ, u) + ½ θᵀ precision θ` from every row, u the offsets; `moving` is 0 where
     a coordinate stays.
 
     `bins` has a leading axis of rows: each may have data of its own. Steps `-(F + λ diag F)⁻¹ g` in
@@ -165,10 +165,10 @@ def _look(
     height, slope, information = (np.array(x) for x in _local(*_padded(likelihood, bins, seen, u)))
     height, slope, information = height[: len(s)], -slope[: len(s)], information[: len(s)]
     free = s.shape[1]
-    weight = np.append(precision, np.zeros(u.shape[1]))
-    cost = -height + 0.5 * np.sum(precision * theta**2, axis=1)
-    slope[:, :free] += precision * theta
-    information += np.diag(weight)
+    pulled = theta @ precision
+    cost = -height + 0.5 * np.sum(pulled * theta, axis=1)
+    slope[:, :free] += pulled
+    information[:, :free, :free] += precision
     if pin is not None:
         values, slopes = pin.seen(likelihood.objective, _filled(seen, len(s)))
         values, slopes = values[: len(s)], slopes[: len(s)]

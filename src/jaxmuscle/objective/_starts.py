@@ -6,10 +6,12 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import ndtri
 
+from jaxmuscle.data._measured import can_be_tested
 from jaxmuscle.data._target import Target
+from jaxmuscle.spectra._peak_test import find_peaks
 
 from ._coordinates import Coordinates
 from ._least_squares import Minima, for_all, least_squares
@@ -17,6 +19,12 @@ from ._problem import FitProblem
 from ._residuals import Data, Residuals
 
 RANGE = 30.0  # of stiffness and damping, about the default
+PEAKED = 3  # of every four starts, the one at a peak
+HEIGHTS = 0.1, 0.3, 0.03  # of a resonance there: its amplitude
+WIDE = 2.0  # Hz, of a tremor whose width is not measured
+NARROW = 0.3  # Hz, of a resonance that stands for a line
+SLOWEST = 1.5  # Hz, of a peak: below, the spectrum bends by itself
+PEAK, ANSWER, OTHER_MODEL, SPREAD, OWN = "peak", "response", "other model", "spread", "own values"
 RESPONSE = ("k_w", "k_z", "c_w", "c_z", "m_w", "m_z", "P_w")
 # starts that begin at the measured response, and steps that are made to find them
 MOST, STEPS = 8, 25
@@ -55,34 +63,117 @@ def starting_points(
 def continued(
     problem: FitProblem, count: int, known: Mapping[str, float]
 ) -> Float[np.ndarray, "starts free"]:
-    """Starts of a richer model: in two thirds of them what it shares with a poorer one begins where
-    that ended (`known`)."""
-    points = np.array(problem.coordinates.theta(starting_points(problem, count)))
-    for column, name in enumerate(problem.coordinates.names):
-        if name in known and problem.coordinates.positive[column]:
-            points[: 2 * len(points) // 3, column] = problem.coordinates.theta_of(name, known[name])
-    return problem.coordinates.from_theta(points)
+    """Starts of a further model: in two thirds of them what it shares with another one begins where
+    that ended (`known`), but for those at peaks.
+
+    In the third of them a narrow resonance stands for its harmonic.
+    """
+    c = problem.coordinates
+    points = np.array(c.theta(starting_points(problem, count)))
+    rows = np.flatnonzero(np.array(kinds_of_starts(problem, count, continued=True)) == OTHER_MODEL)
+    for column, name in enumerate(c.names):
+        if name in known and c.positive[column]:
+            points[rows, column] = c.theta_of(name, known[name])
+    for name in resonance_names(c) if len(rows) > 1 else ():
+        line = known.get(name.replace("resonance", "harmonic"), 0.0)
+        if "_2_" not in name and line > 0 and _inside(c, name, np.array([line]))[0]:
+            points[rows[1], c.names.index(name)] = c.theta_of(name, line)
+            width = name.replace("frequency", "width")
+            if width in c.names:
+                points[rows[1], c.names.index(width)] = c.theta_of(width, NARROW)
+    return c.from_theta(points)
+
+
+def kinds_of_starts(problem: FitProblem, count: int, *, continued: bool = False) -> tuple[str, ...]:
+    """How each start was chosen: at a peak, by the measured response, where another model ended,
+    or spread."""
+    rows, names = np.arange(count), problem.coordinates.names
+    kinds = np.full(count, SPREAD, dtype=object)
+    if resonance_names(problem.coordinates):
+        kinds[rows % 4 == PEAKED] = PEAK
+    elif frequency_names(problem.coordinates):
+        kinds[rows < count // 2] = PEAK
+    elif count:
+        kinds[0] = OWN
+    if continued:
+        at_peaks = bool(resonance_names(problem.coordinates)) & (rows % 4 == PEAKED)
+        kinds[(rows % 3 != 2) & ~at_peaks] = (
+            OTHER_MODEL  # the rest, of all kinds, may contradict them
+        )
+    answers = any(name.partition("@")[0] in RESPONSE for name in names)
+    if problem.control and answers and any(part.points is not None for part in problem.parts):
+        kinds[_answering_rows(count)] = ANSWER
+    return tuple(kinds)
+
+
+def resonance_names(coordinates: Coordinates) -> list[str]:
+    """The free frequencies of resonances; in a joint fit targets may have one each."""
+    return [
+        name
+        for name in coordinates.names
+        if name.partition("@")[0] in ("resonance_frequency", "resonance_2_frequency")
+    ]
+
+
+def _inside(
+    c: Coordinates, name: str, frequency: Float[np.ndarray, " frequencies"]
+) -> Bool[np.ndarray, " frequencies"]:
+    """Which frequencies lie within the bounds of a parameter."""
+    i, theta = c.names.index(name), c.theta_of(name, frequency)
+    return (theta > c.low[i]) & (theta < c.high[i])
 
 
 def _spread_resonances(problem: FitProblem, theta: Float[np.ndarray, "starts free"]) -> None:
-    """Every other start has its resonances at candidates of the target; of two the first is the
-    higher one."""
-    names, rows = problem.coordinates.names, np.arange(1, len(theta), 2)
-    of = [
-        name.partition("_frequency")[2] for name in names if name.startswith("resonance_frequency")
-    ]
-    for target in of if len(rows) else ():
-        pair = [
-            n
-            for n in (f"resonance_frequency{target}", f"resonance_2_frequency{target}")
-            if n in names
-        ]
-        each = [
-            np.random.default_rng(i).permutation(frequencies_for(problem, n, len(rows)))
-            for i, n in enumerate(pair)
-        ]
-        for name, frequencies in zip(pair, -np.sort(-np.stack(each), axis=0), strict=True):
-            theta[rows, names.index(name)] = problem.coordinates.theta_of(name, frequencies)
+    """Of every four starts one has each resonance at candidates of the target, and one at what
+    stands out of its spectrum.
+
+    The latter have a resonance as wide as the peak, in turn of a few heights, and every other one
+    the default muscle, which damps, over a low floor. A peak that is high above a low floor is far
+    from the default in several parameters at once: no other start lies there.
+    """
+    c, rows = problem.coordinates, np.arange(1, len(theta), 4)
+    for number, name in enumerate(resonance_names(c)):
+        found = frequencies_for(problem, name, len(theta))
+        found = np.resize(found[_inside(c, name, found)], len(rows))
+        spread = np.random.default_rng(number).permutation(found)
+        theta[rows, c.names.index(name)] = c.theta_of(name, spread)
+    rows = np.arange(PEAKED, len(theta), 4)
+    peaks = {name: _peaks_of(problem, name) for name in resonance_names(c)}
+    if not len(rows) or not any(peaks.values()):
+        return
+    most, turn = max(map(len, peaks.values())), np.arange(len(rows))
+    still = rows[(turn // most) % 2 == 0]
+    theta[still] = 0.0
+    for column, name in enumerate(c.names):
+        if name.partition("@")[0] == "noise_K_z":
+            theta[still, column] = -1 / c.sd[column]
+    for name, each in peaks.items():
+        if not each:
+            continue
+        frequency, width = np.array(each)[turn % len(each)].T
+        height = np.resize(HEIGHTS, len(rows) * len(each))[turn // len(each)]
+        own = {"frequency": frequency, "width": width, "amplitude": height}
+        for what, values in own.items():
+            if (key := name.replace("frequency", what)) in c.names:
+                theta[rows, c.names.index(key)] = c.theta_of(key, values)
+
+
+def _peaks_of(problem: FitProblem, name: str) -> list[tuple[float, float]]:
+    """Frequency and width [Hz] of what stands out of the spectra within the bounds of a resonance,
+    whether or not it is significant: the tremor that is measured (over more bins than are
+    compared), then the clearest hills of the bins, if these can be tested."""
+    c, found = problem.coordinates, []
+    column = c.names.index(name)
+    low, high = c.centre[column] * np.exp(c.sd[column] * np.array([c.low[column], c.high[column]]))
+    for target in (part.target for part in problem.acting(name)):
+        seen = target.measured.get("tremor_frequency")
+        if seen is not None and low < seen.value < high:
+            found.append((seen.value, WIDE))
+        band = max(float(low), SLOWEST), min(float(high), float(target.frequency[-1]))
+        if can_be_tested(target, band):
+            given = target.proportional_power, target.settings, target.segments or (), band
+            found += [(hill.frequency, hill.width) for hill in find_peaks(*given, level=1.0).peaks]
+    return [(f, width) for f, width in found if low < f < high]
 
 
 def _spread_coefficients(problem: FitProblem, theta: Float[np.ndarray, "starts free"]) -> None:
@@ -111,7 +202,7 @@ def _on_response(
     where the dynamic stiffness alone is fitted best, and where beside this muscle the fluctuations
     are.
     """
-    rows = np.arange(2 * len(points) // 3, len(points))[::2][:MOST]
+    rows = _answering_rows(len(points))
     answers = np.isin([name.partition("@")[0] for name in problem.coordinates.names], RESPONSE)
     # of an own muscle nobody knows which parameters answer
     if not problem.control or not len(rows) or not np.any(answers):
@@ -126,6 +217,10 @@ def _on_response(
     beside = least_squares(held, points[rows], STEPS)
     points[rows] = np.where(np.isfinite(beside.cost)[:, None], beside.s, points[rows])
     return points
+
+
+def _answering_rows(count: int) -> Int[np.ndarray, " rows"]:
+    return np.arange(2 * count // 3, count)[::2][:MOST]
 
 
 def _answering(problem: FitProblem, objective: Residuals) -> Float[np.ndarray, " free"] | None:

@@ -18,7 +18,7 @@ from jaxmuscle.objective._derived import MEAN, MEANINGS, VARIATION
 from jaxmuscle.spectra._bin_law import ENOUGH
 from jaxmuscle.spectra._fluctuations import BANDS, in_bands
 
-from ._ladder_text import gain_sentences, ladder_table, skipped_models
+from ._ladder_text import explain_choice, ladder_table
 
 LENGTHS = ("x_ref_w", "x_ref_z")
 OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
@@ -66,7 +66,7 @@ def fit_card(result: FitResult) -> Card:
     rows += sorted(of_model, key=lambda row: order.index(row[4]))
     remarks = (
         f"{_head(result)}: {result.message}",
-        *_gains(result),
+        *_choice(result),
         *result.advice,
         *result.notices,
         *result.remarks,
@@ -93,8 +93,7 @@ def fit_text(result: FitResult, *, everything: bool = False) -> str:
     lines += [f"  {result.message}"] * result.success
     if everything:
         lines += [f"  {row}" for row in ladder_table(result.ladder, _datum(result))]
-        lines += [f"  {sentence}" for sentence in skipped_models(result.ladder)]
-        lines += [f"  {sentence}" for sentence in _gains(result)]
+        lines += [f"  {sentence}" for sentence in _choice(result)]
     lines += _fitted_targets(result)
     if not everything:
         lines += [f"  {sentence}" for sentence in result.advice]
@@ -436,9 +435,14 @@ def _closeness(part: FittedPart, before: str = "", *, verdict: str = "") -> str:
     return before * bool(said) + ", ".join(said)
 
 
-def _gains(result: FitResult) -> tuple[str, ...]:
-    """What the parts of the chosen model gain, where several models were tried."""
-    return gain_sentences(result.ladder, describes=result.adequate, datum=_datum(result))
+def _choice(result: FitResult) -> tuple[str, ...]:
+    """Why the models were tried."""
+    tremor = any(
+        math.isfinite(part.target.measured["tremor_frequency"].value)
+        for part in result.parts.values()
+        if "tremor_frequency" in part.target.measured
+    )
+    return explain_choice(result.ladder, _datum(result), tremor=tremor)
 
 
 def _datum(result: FitResult) -> str:

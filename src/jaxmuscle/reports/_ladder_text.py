@@ -3,10 +3,8 @@
 import itertools
 
 from jaxmuscle._common.text import probability
-from jaxmuscle.fits._adequacy import ADEQUATE
-from jaxmuscle.fits._harmonic_evidence import SIGNIFICANT
-from jaxmuscle.fits._ladder import ALIKE, Rung
-from jaxmuscle.model._rungs import QUIET, rung_name
+from jaxmuscle.fits._ladder import Rung
+from jaxmuscle.model._rungs import RICHER
 
 
 def ladder_table(ladder: tuple[Rung, ...], datum: str) -> list[str]:
@@ -28,60 +26,41 @@ def format_p(p: float) -> str:
     return probability(p).removeprefix("p ").removeprefix("= ")
 
 
-def gain_sentences(
-    ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin"
+def explain_choice(
+    ladder: tuple[Rung, ...], datum: str = "bin", *, tremor: bool = False
 ) -> tuple[str, ...]:
-    """What every part of the chosen model gains over the best model without it, in sentences; and
-    what such a number says.
+    """Why the models were tried, in sentences: for a `tremor` that is seen, or for the description
+    alone; and where a richer one fits worse.
 
-    `describes`: whether the chosen model describes the data; `datum`, what chi² is counted for.
+    `datum`, what chi² is counted for.
     """
-    number = next((rung.number for rung in ladder if rung.chosen), QUIET)
-    climbed = tuple(rung for rung in ladder if rung.number <= number)
-    said = tuple(_gain(climbed[:i], after, datum) for i, after in enumerate(climbed) if i)
-    if not said:
+    chosen = next((rung for rung in ladder if rung.chosen), None)
+    if chosen is None:
         return ()
-    meaning = (
-        "the AIC weighs how well a model fits against its number of parameters: lower is better. A"
-        f" difference of {ALIKE:g} or less says nothing. jaxmuscle compare is stricter: it needs at"
-        " least 6, and the richer model must also predict bins better that were left out of its"
-        " fit. The AIC is no p-value"
-    )
-    if any(after.aic > before.aic for before, after in itertools.pairwise(climbed)) and number > 0:
-        meaning += (
-            ". A richer model can fit worse here, since models with activation or resonance keep"
-            " stiffness and damping nearer to their usual values"
+    numbers, said = [rung.number for rung in ladder], list[str]()
+    first = next((n for n in numbers if tremor and n >= RICHER["resonance"]), numbers[0])
+    if tremor and first >= RICHER["resonance"]:
+        slower = first > RICHER["resonance"]
+        said.append(
+            f"the spectrum shows a tremor{' and a slower peak' * slower}, so the first model tried"
+            f" has {'two resonances' if slower else 'a resonance'}"
         )
-    if describes is False:
-        meaning += (
-            ". No model that was tried describes the data: then a lower AIC says that a model"
-            " misses less, not that the muscle has this part"
+    if numbers[0] < first:
+        said.append(
+            "that came out narrower than a bin, so models with a line of zero width were tried, too"
         )
-    return (*said, meaning)
-
-
-def skipped_models(ladder: tuple[Rung, ...]) -> tuple[str, ...]:
-    """Which models between those of a table are missing there, and why, in sentences."""
-    return tuple(
-        f"model {before.number} already describes the data, so model {number} was not tried. But"
-        f" the harmonic of model {before.number} is significant (p < {SIGNIFICANT:g}) and may be a"
-        f" tremor, so model {after.number} was tried as well"
+    if numbers[-1] > first:
+        poorer = next(rung for rung in ladder if rung.number == first)
+        said.append(
+            f"{poorer.model} does not describe the data ({probability(poorer.p)}). Richer models"
+            " were tried for the description alone: no further peak asks for them"
+        )
+    if len(ladder) > 1:
+        said.append("the model with the lowest AIC was taken")
+    said += [
+        f"{after.model} fits worse than {before.model} (chi2 per {datum} {after.chi2_per_bin:.2f}"
+        f" against {before.chi2_per_bin:.2f})"
         for before, after in itertools.pairwise(ladder)
-        if before.p >= ADEQUATE
-        for number in range(before.number + 1, after.number)
-    )
-
-
-def _gain(poorer: tuple[Rung, ...], after: Rung, datum: str) -> str:
-    """AIC and chi² of a model against those of the best of the poorer ones."""
-    last, best = poorer[-1], min(poorer, key=lambda rung: rung.aic)
-    added = " and ".join(
-        "with a harmonic" if n == 0 else rung_name(n)
-        for n in range(last.number + 1, after.number + 1)
-    )
-    change = after.aic - best.aic
-    against = "" if best is last else f" against the best model before ({best.model})"
-    return (
-        f"{added} the AIC {'falls' if change < 0 else 'rises'} by {abs(change):.1f}{against} (chi2"
-        f" per {datum} {after.chi2_per_bin:.2f} instead of {best.chi2_per_bin:.2f})"
-    )
+        if after.number <= chosen.number and after.chi2_per_bin > before.chi2_per_bin
+    ]
+    return tuple(said)

@@ -187,7 +187,7 @@ def _tried(result: "FitResult") -> list[str]:
         for rung in result.ladder
     )
     chosen = next(rung.model for rung in result.ladder if rung.chosen)
-    return [f"Models were tried from the simplest on: {each}. We report the fit of: {chosen}."]
+    return [f"Models were tried one after the other: {each}. We report the fit of: {chosen}."]
 
 
 def _assumed(result: "FitResult") -> list[str]:
@@ -209,7 +209,16 @@ def _assumed(result: "FitResult") -> list[str]:
         "Priors (of positive parameters log-normal) had these centres (standard deviations):"
         f" {priors}."
     )
-    return [stated] * bool(priors) + ([f"Held fixed were {', '.join(held)}."] if held else [])
+    ratio = (
+        " The logarithm of the damping ratio had a normal prior, too, about that of these centres"
+        f" (standard deviation {result.settings['damping_ratio_sd']:.2g}): it keeps the muscle from"
+        " swinging."
+        if result.settings.get("damping_ratio_sd")
+        else ""
+    )
+    return [stated + ratio] * bool(priors) + (
+        [f"Held fixed were {', '.join(held)}."] if held else []
+    )
 
 
 def _welch(s: SpectrumSettings) -> str:

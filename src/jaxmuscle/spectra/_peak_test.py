@@ -77,8 +77,13 @@ def bins_around(band: tuple[float, float], settings: SpectrumSettings) -> tuple[
 
 def bins_in(band: tuple[float, float], settings: SpectrumSettings) -> Int[np.ndarray, " bins"]:
     """The bins of the settings about a band, by their numbers; none where they are too few for the
-    test."""
+    test.
+
+    Where the settings end before the bins that are wanted above the band, as many more are taken
+    below it, in octaves: a hill is seen against what is smooth on both sides.
+    """
     first, last = bins_around(band, settings)
+    first = max(1, int(np.ceil(first * min(1.0, settings.last_bin / last))))
     bins = np.arange(max(first, settings.first_bin), min(last, settings.last_bin) + 1)
     # The polynomial, a bell, and as many bins again for the scatter.
     enough = len(bins) >= 2 * (DEGREE + 2) and bins[-1] * settings.resolution >= (

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._tasks import PrescribedLength
-from jaxmuscle.objective._arguments import COEFFICIENTS, NARROW, base_of
+from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import Expansion, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._likelihood import Likelihood, without_offsets
@@ -65,25 +65,7 @@ def opened(problem: FitProblem) -> FitProblem:
         parts=tuple(parts),
         coordinates=_widened(c, first),
         prior=np.append(problem.prior, np.ones(len(masses))),
-    )
-
-
-def prior_beside_a_motion(problem: FitProblem) -> Float[np.ndarray, " free"]:
-    """Precision of the prior that θ has in a fit with a moved record: there stiffness and damping
-    have their usual one.
-
-    A fit of held records by a model with activation takes a narrower one, if none is given.
-    """
-    if all(part.task.activation is None for part in problem.parts):
-        return problem.prior
-    c = problem.coordinates
-    usual = {
-        n: PARAMETERS[base_of(n)].prior_sd
-        for n, sd in zip(c.names, c.sd, strict=True)
-        if base_of(n) in COEFFICIENTS and sd == NARROW
-    }
-    return problem.prior * np.array(
-        [(NARROW / usual[n]) ** 2 if n in usual else 1.0 for n in c.names]
+        damping=tuple(np.append(row, np.zeros(len(masses))) for row in problem.damping),
     )
 
 
@@ -130,7 +112,11 @@ def design_information(
     own, coordinates = coordinates_of(like, theta, task)
     local = _local(like, coordinates, task, design)
     here = dataclasses.replace(
-        problem, parts=(local,), coordinates=coordinates, prior=problem.prior[own]
+        problem,
+        parts=(local,),
+        coordinates=coordinates,
+        prior=problem.prior[own],
+        damping=tuple(row[own] for row in problem.damping),
     )
     seen = seen_here(here, theta[own])
     (moments,) = seen.moments

@@ -226,7 +226,7 @@ class Here(NamedTuple):
             ):
                 unit = unit_of(name, problem.parts[part].task.output_unit)
                 values[name], gradients[name] = (float(value), unit), g
-        return cls(c, information_of(problem, seen), problem.prior, values, gradients, free)
+        return cls(c, information_of(problem, seen), problem.precision, values, gradients, free)
 
     def outlook(
         self,
@@ -243,11 +243,9 @@ class Here(NamedTuple):
         """What is known with that information; the further masses are known, too, unless they are
         asked to be open."""
         size = len(self.prior) if masses else self.free
-        after = np.linalg.pinv(
-            information[:size, :size] + np.diag(self.prior[:size]), hermitian=True
-        )
+        after = np.linalg.pinv(information[:size, :size] + self.prior[:size, :size], hermitian=True)
         every, found = (Identifiability.of_covariance(after[:n, :n]) for n in (size, self.free))
-        before = np.diag(1 / np.maximum(self.prior[:size], LEAST_PRIOR))
+        before = np.linalg.inv(self.prior[:size, :size] + LEAST_PRIOR * np.eye(size))
         c, known = self.coordinates, {}
         for n in (n for n in self.gradients if n not in c.names[self.free :]):
             g = self.gradients[n][:size]

@@ -26,7 +26,6 @@ from ._design_information import (
     coordinates_of,
     design_information,
     opened,
-    prior_beside_a_motion,
     seen_here,
 )
 from ._designed_input import DOUBTFUL, DesignedInput
@@ -306,7 +305,8 @@ class Experiment(NamedTuple):
         )
         like = design.like(problem)
         task: Any = _moved(like.task).with_parts(settings=like.target.settings)
-        prior = prior_beside_a_motion(problem)
+        # a response tells how the muscle is damped, so the ratio needs no prior of its own
+        prior = problem.prior
         start = np.diag(prior) + (here.information if isinstance(given, FitResult) else 0.0)
         apart = start + design_information(
             problem, theta, dataclasses.replace(design, task=task, lengthening=None)

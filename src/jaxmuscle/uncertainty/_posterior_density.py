@@ -245,8 +245,9 @@ class PosteriorDensity(eqx.Module):
         theta = c.theta(s)
         bounded = jnp.isfinite(jnp.asarray(c.low))
         stretch = jnp.where(bounded, jax.nn.log_sigmoid(s) + jax.nn.log_sigmoid(-s), 0.0)
-        each = -0.5 * jnp.asarray(self.likelihood.objective.prior) * theta**2 + stretch
-        return jnp.sum(each[columns])
+        # What is summed over has its own prior in the weights of the grid.
+        pulled = jnp.asarray(self.likelihood.objective.prior_root)[:, columns] @ theta[columns]
+        return jnp.sum(stretch[columns]) - 0.5 * jnp.sum(pulled**2)
 
     def log_density(self, white: Float[Array, " sampled"]) -> Scalar:
         """The density; minus infinity where a task has no stable equilibrium."""
@@ -284,7 +285,7 @@ def density_about(
                 f"the prior of {name} is flat and without bounds, so there is no posterior: give it"
                 f" a prior (priors={{{name!r}: sd}}) or bounds ({name!r}: (low, high))"
             )
-    peak, best = highest(problem, likelihood, theta, problem.prior)
+    peak, best = highest(problem, likelihood, theta, problem.precision)
     summed = frequency_names(coordinates)
     bands = tuple(band_about(problem, peak, name) for name in summed)
     columns = tuple(i for i, name in enumerate(names) if name not in summed)

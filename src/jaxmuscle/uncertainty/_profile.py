@@ -159,9 +159,7 @@ def profile(
         if name not in known:
             raise ValueError(f"name = {name!r} is neither free nor derived: {choices(name, known)}")
         likelihood = Likelihood.of(problem)
-        precision = (
-            np.asarray(problem.prior, dtype=float) if with_priors else np.full(len(names), WEAK)
-        )
+        precision = problem.precision if with_priors else WEAK * np.eye(len(names))
         peak, best = highest(
             problem, likelihood, problem.theta_of(tuple(result.tasks.values())), precision
         )
@@ -255,7 +253,8 @@ def _derived(
     seen = quantities(likelihood.objective, expand(likelihood.objective, found.theta))[0][part][
         quantity
     ]
-    cost = 0.5 * np.sum(precision * found.theta**2, axis=1) - found.log_likelihood
+    pulled = np.sum((found.theta @ precision) * found.theta, axis=1)
+    cost = 0.5 * pulled - found.log_likelihood
     value, height, cost = _best_of(
         seen, found.log_likelihood, np.where(np.isfinite(found.cost), cost, np.inf), len(held)
     )
