@@ -161,6 +161,7 @@ def _models(
     recordings: tuple[PerturbedRecording, ...],
 ) -> Models:
     """The models that may be fitted: of a moved record also noise alone."""
+    target = target.with_measures()
     base, options = at_mean(task, target, given)
     # no verdict
     unknown = len(target.bins) > 0 and target.segments is None and target.sigma is None

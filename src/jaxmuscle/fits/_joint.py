@@ -269,7 +269,7 @@ def _loaded(targets: Mapping[str, Any], tasks: Mapping[str, AbstractTask]) -> di
     for name in targets:
         if not name or "@" in name:
             raise ValueError(f"targets: a name must not be empty nor contain '@', as {name!r} does")
-    return {name: aimed(t, tasks.get(name)) for name, t in targets.items()}
+    return {name: aimed(t, tasks.get(name)).with_measures() for name, t in targets.items()}
 
 
 def _any_moved(targets: Mapping[str, Target]) -> bool:

@@ -327,7 +327,7 @@ def _parts(
         ]
         notices += own if len(tasks) == 1 else [f"{part.name}: {notice}" for notice in own]
         parts[part.name or target.name] = FittedPart(
-            target=ended.signals[i].widened(target.with_measures()),
+            target=ended.signals[i].widened(target),
             task=task,
             chi2_per_bin=(
                 float(np.sum(residual**2) / (len(residual) - 1))

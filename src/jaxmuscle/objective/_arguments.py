@@ -272,6 +272,7 @@ def planned(
     together with it.
     """
     moved = target.stiffness is not None if moved is None else moved
+    target = target.with_measures()  # starts and report look at them
     bounds, priors, fix = (
         dict(options.bounds or {}),
         dict(options.priors or {}),

@@ -134,9 +134,10 @@ def _spread_resonances(problem: FitProblem, theta: Float[np.ndarray, "starts fre
     c, rows = problem.coordinates, np.arange(1, len(theta), 4)
     for number, name in enumerate(resonance_names(c)):
         found = frequencies_for(problem, name, len(theta))
-        found = np.resize(found[_inside(c, name, found)], len(rows))
-        spread = np.random.default_rng(number).permutation(found)
-        theta[rows, c.names.index(name)] = c.theta_of(name, spread)
+        found = found[_inside(c, name, found)]
+        if len(found):
+            spread = np.random.default_rng(number).permutation(np.resize(found, len(rows)))
+            theta[rows, c.names.index(name)] = c.theta_of(name, spread)
     rows = np.arange(PEAKED, len(theta), 4)
     peaks = {name: _peaks_of(problem, name) for name in resonance_names(c)}
     if not len(rows) or not any(peaks.values()):
