@@ -210,7 +210,7 @@ def _together(each: list[Measure]) -> Measure:
     return _measure(float(np.mean(values)), error, first.unit, first.error_from)
 
 
-def widened(
+def widen_errors(
     measures: Measures,
     signals: Sequence[Float[np.ndarray, " _"]],
     widening: float,

@@ -22,7 +22,7 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 from . import _target_fields as check
 from ._frequency_response import FrequencyResponse
 from ._measure import Measure
-from ._measured import measure_spectrum, widened
+from ._measured import measure_spectrum, widen_errors
 from ._target_fields import Provenance, Quantity, numbers_of
 from ._target_files import KEYS, REQUIRED, fields_of, on_grid, read_target, settings_of
 
@@ -310,11 +310,11 @@ class Target(Shown, eqx.Module):
         return Target.from_table(self.to_table() | {"measured": self.measured})
 
     def with_unsteady_errors(self, widening: float, common: float) -> "Target":
-        """The same with wider errors of what was measured, see `widened`; those of a bare
+        """The same with wider errors of what was measured, see `widen_errors`; those of a bare
         spectrum stay."""
         if self.measures is None or not self.signals:
             return self
-        wider = widened(self.measured, self.signals, widening, common)
+        wider = widen_errors(self.measured, self.signals, widening, common)
         return Target.from_table(self.to_table() | {"measured": wider})
 
     def plot(self, ax: Any = None, *, log: bool = False) -> Any:

@@ -11,7 +11,7 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import HARMONIC
-from jaxmuscle.model._resonant_noise import ResonantNoise
+from jaxmuscle.model._resonant_noise import narrow_resonances
 from jaxmuscle.model._rungs import QUIET, RICHER, rung_name
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, Plan
@@ -138,10 +138,10 @@ def climb(models: Models, descend: Descend, keep: Callable[[Climbed], None]) -> 
 def is_narrow(found: Climbed) -> bool:
     """Whether a resonance of the fitted model is narrower than a bin."""
     problem = found.plan.problem
+    tasks = problem.tasks_at(found.ended.seen.theta)
     return any(
-        isinstance(noise, ResonantNoise) and float(noise.width) < part.target.settings.resolution
-        for part, task in zip(problem.parts, problem.tasks_at(found.ended.seen.theta), strict=True)
-        for noise in task.noise.components
+        narrow_resonances(task.noise, part.target.settings.resolution)
+        for part, task in zip(problem.parts, tasks, strict=True)
     )
 
 

@@ -66,7 +66,8 @@ def find_unseen(
         if any(_near(estimate.value, f) for f in seen):
             continue
         at = "@" + own if own else ""
-        without |= {n for n in table if _belongs(n, which) and n.endswith(at)}
+        names = {f"{which}_{what}" for what in ("amplitude", "frequency", "width", "share")}
+        without |= {n for n in table if base_of(n) in names and n.endswith(at)}
         said.append(_why(name, estimate.value, seen))
     return without, tuple(said)
 
@@ -77,14 +78,6 @@ def _of(peaks: list[float | None], parts: Iterable[int]) -> list[float]:
 
 def _near(frequency: float, peak: float) -> bool:
     return abs(math.log(max(frequency, 1e-9) / peak)) < NEAR
-
-
-def _belongs(name: str, which: str) -> bool:
-    """Whether a quantity is one of this resonance."""
-    base = base_of(name)
-    return base.startswith(f"{which}_") and (
-        which != "resonance" or not base.startswith("resonance_2_")
-    )
 
 
 def _why(name: str, value: float, seen: list[float]) -> str:

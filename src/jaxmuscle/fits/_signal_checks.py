@@ -15,7 +15,7 @@ from jaxmuscle._common.types import Key
 from jaxmuscle.data._measured import RECORDED
 from jaxmuscle.data._target import Target
 from jaxmuscle.ensembles._ensemble import ensemble
-from jaxmuscle.model._resonant_noise import ResonantNoise
+from jaxmuscle.model._resonant_noise import narrow_resonances
 from jaxmuscle.model._task import AbstractTask
 from jaxmuscle.response._density import noise_density
 from jaxmuscle.response._equilibrium import slowest_rate
@@ -43,6 +43,11 @@ SUMS = 4999  # of several trials, of which each is drawn from the simulated ones
 LEAD, FORGOTTEN, LONGEST_LEAD = 5.0, 8.0, 20.0  # s; decay times before the record begins; s
 STEP = 5.0  # s: one program for records that differ by less
 RATE = float(RECORDED.rate)
+DO = (
+    "A muscle's noise does not make one. What to do: look for its source (mains, motor, a display,"
+    " the pulse). If it is the person's own, record longer, and take its frequency from"
+    " Recording.fft_spectrum"
+)
 
 
 class SignalTest(NamedTuple):
@@ -94,26 +99,16 @@ def check_signals(target: Target, task: AbstractTask, key: Key) -> SignalTest:
         sharp = tuple(
             f"a sharp rhythm at {float(noise.frequency):.2f} Hz: the fitted resonance is"
             f" {float(noise.width):.2g} Hz wide, narrower than a bin ({resolution:.2g} Hz). {DO}"
-            for noise in task.noise.components
-            if isinstance(noise, ResonantNoise) and float(noise.width) < resolution
+            for noise in narrow_resonances(task.noise, resolution)
         )
     steady = _steadiness(signals, task, density, key)
     return steady._replace(notices=(*steady.notices, *sharp))
 
 
-DO = (
-    "A muscle's noise does not make one. What to do: look for its source (mains, motor, a display,"
-    " the pulse). If it is the person's own, record longer, and take its frequency from"
-    " Recording.fft_spectrum"
-)
-
-
 def _smooth(task: AbstractTask, resolution: float) -> Density:
     """The fitted spectrum without harmonic and without resonances that are narrower than a bin."""
-    smooth = [
-        not isinstance(noise, ResonantNoise) or float(noise.width) >= resolution
-        for noise in task.noise.components
-    ]
+    narrow = narrow_resonances(task.noise, resolution)
+    smooth = [all(noise is not each for each in narrow) for noise in task.noise.components]
     return lambda f: np.sum(noise_density(task, f)[np.array(smooth)], axis=0)
 
 
@@ -252,7 +247,8 @@ def _of_errors(found: SignalTest, trials: int) -> str:
             " errors come from this scatter, which contains the change already"
         )
     return (
-        f"So {model}, and so are the measured ones of shares, powers and variation; a power can be"
-        f" off by {100 * math.sqrt(found.common):.2g} % more, a variation by half of that. What to"
-        f" do: record more trials. From {ENOUGH} on errors come from their scatter"
+        f"So {model}, and so are the measured ones of shares, powers and variation. Besides, all"
+        f" powers may be too large or too small together, by {100 * math.sqrt(found.common):.2g} %,"
+        " and the variation by half of that: their errors contain it. What to do: record more"
+        f" trials. From {ENOUGH} on errors come from their scatter"
     )

@@ -112,3 +112,13 @@ class ResonantNoise(AbstractNoise):
             " wide: use dt <= 0.1 / (resonance_frequency + resonance_width) ="
             f" {0.1 / (self.frequency + self.width)} s",
         )
+
+
+def narrow_resonances(noise: AbstractNoise, resolution: float) -> tuple[ResonantNoise, ...]:
+    """The resonances of a noise, or of a sum, that are narrower than a bin [Hz]: in a spectrum they
+    look like lines."""
+    return tuple(
+        each
+        for each in noise.components
+        if isinstance(each, ResonantNoise) and float(each.width) < resolution
+    )

@@ -96,10 +96,9 @@ def kinds_of_starts(problem: FitProblem, count: int, *, continued: bool = False)
     elif count:
         kinds[0] = OWN
     if continued:
-        at_peaks = bool(resonance_names(problem.coordinates)) & (rows % 4 == PEAKED)
-        kinds[(rows % 3 != 2) & ~at_peaks] = (
-            OTHER_MODEL  # the rest, of all kinds, may contradict them
-        )
+        # the rest, of all kinds, may contradict these
+        at_peaks = (kinds == PEAK) & bool(resonance_names(problem.coordinates))
+        kinds[(rows % 3 != 2) & ~at_peaks] = OTHER_MODEL
     answers = any(name.partition("@")[0] in RESPONSE for name in names)
     if problem.control and answers and any(part.points is not None for part in problem.parts):
         kinds[_answering_rows(count)] = ANSWER
