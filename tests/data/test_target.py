@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from jaxmuscle._common import bundled as _bundled
 from jaxmuscle._common.bundled import describe_targets, list_targets
 from jaxmuscle._common.errors import TargetError
+from jaxmuscle.data import is_recording
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -268,20 +269,23 @@ def test_interpolation_is_linear_in_log_power(tmp_path):
     text = "frequency_hz,proportional_power,sigma\n"
     text += "".join(f"{f},{np.exp(-f)},{0.1 * np.exp(-f)}\n" for f in frequency)
     target = load_target(write(tmp_path, text))
-    expected = np.exp(-GRID) / np.exp(-GRID).sum()
+    # six numbers do not become thirty: the bins nearest to them
+    np.testing.assert_array_equal(target.bins, [1, 3, 6, 13, 23])
+    expected = np.exp(-GRID)[target.bins - 1]
+    expected /= expected.sum()
     np.testing.assert_allclose(target.proportional_power, expected, rtol=1e-12)
     assert target.sigma is not None
     np.testing.assert_allclose(target.sigma, 0.1 * expected, rtol=1e-12)
-    assert "so the log power was interpolated (widest gap 4 Hz)" in target.notices[0]
+    assert "so the log power was interpolated (widest gap 4 Hz)" in " ".join(target.notices)
 
 
 def test_no_extrapolation(tmp_path):
     target = load_target(write(tmp_path, csv_text([1.0, 2.0, 4.0], [3.0, 2.0, 1.0])))
-    np.testing.assert_array_equal(target.bins, np.arange(3, 11))
-    np.testing.assert_array_equal(target.frequency, GRID[2:10])
+    np.testing.assert_array_equal(target.bins, [3, 5, 10])
+    np.testing.assert_array_equal(target.frequency, GRID[[2, 4, 9]])
     assert target.proportional_power.sum() == pytest.approx(1, abs=1e-12)
     assert any(
-        "no value in the bins 1 to 2, 11 to 30, so these are left out" in notice
+        "no value in the bins 1 to 2, 4, 6 to 9, 11 to 30, so these are left out" in notice
         for notice in target.notices
     )
 
@@ -353,8 +357,86 @@ def test_dialects(text, tmp_path):
     np.testing.assert_array_equal(target.proportional_power, [0.75, 0.25])
 
 
+FREQUENCY = 0.390625 * np.arange(60)
+POWER = 1 / (1 + (FREQUENCY / 3) ** 2)
+
+
+def spectrum_text(header, frequency=FREQUENCY, power=POWER, sign=","):
+    rows = zip(frequency, power, strict=True)
+    return header + "\n" + "".join(f"{f:.10g}{sign}{p:.10g}\n" for f, p in rows)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "frequency,power",
+        "f,Pxx",
+        "Frequency (Hz),PSD (N^2/Hz)",
+        "Hz,Leistungsdichte",
+        "freq,power spectrum",
+    ],
+)
+def test_names_that_programs_give_and_a_row_at_0_hz(header, tmp_path):
+    path = write(tmp_path, spectrum_text(header))
+    target = load_target(path)
+    np.testing.assert_allclose(target.proportional_power, POWER[1:31] / POWER[1:31].sum())
+    assert "the row at 0 Hz is the mean, and is left out" in target.notices
+    assert not is_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "scaled", "scale"),
+    [
+        ("Frequency [Hz],PSD [dB/Hz]", 10 * np.log10(POWER), "dB"),
+        ("freq,power_dB", 10 * np.log10(POWER), "dB"),
+        ("f,dB", 10 * np.log10(POWER), "dB"),
+        ("f,log10(Pxx)", np.log10(POWER), "log10"),
+        ("f,ln_power", np.log(POWER), "ln"),
+    ],
+)
+def test_decibels_and_logarithms(header, scaled, scale, tmp_path):
+    target = load_target(write(tmp_path, spectrum_text(header, power=scaled)))
+    np.testing.assert_allclose(target.proportional_power, POWER[1:31] / POWER[1:31].sum())
+    assert f"the powers are in {scale}, and were converted" in target.notices
+
+
+def test_a_first_frequency_near_bin_1_is_not_lost(tmp_path):
+    near = 0.4 * np.arange(1, 30)
+    text = spectrum_text("frequency,power", near, 1 / (1 + (near / 3) ** 2))
+    target = load_target(write(tmp_path, text))
+    np.testing.assert_array_equal(target.bins, np.arange(1, 30))
+    expected = POWER[1:30] / POWER[1:30].sum()
+    np.testing.assert_allclose(target.proportional_power, expected, rtol=3e-3)
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0])
+def test_coarse_frequencies_are_not_thirty_numbers(step, tmp_path):
+    coarse = step * np.arange(1, 26)
+    text = spectrum_text("frequency,power", coarse, 1 / (1 + (coarse / 3) ** 2))
+    target = load_target(write(tmp_path, text))
+    inside = coarse[(coarse > 0.35) & (coarse < 11.8)]
+    assert len(target.bins) <= inside.size
+    off = np.abs(target.frequency[:, None] - inside).min(axis=1)
+    assert np.all(off <= 0.5 * 0.390625 + 1e-9)
+    assert any("interpolated powers are no measurements" in notice for notice in target.notices)
+
+
+def test_a_force_called_f_is_a_recording(tmp_path):
+    time = np.arange(3000) / 100
+    path = write(tmp_path, spectrum_text("time,f", time, 20 + np.sin(time)))
+    assert is_recording(path)
+
+
 HEADER = "frequency_hz,proportional_power\n"
 BAD_CSV = {
+    "dB without a name": ("frequency,power\n0.4,-3\n0.8,-7\n", "name the column power_dB"),
+    "dB without a header": ("0.4,-3\n0.8,-7\n", "in a first line frequency_hz,power_dB"),
+    "log of which base": ("f,log power\n0.4,-3\n0.8,-7\n", "(log10_power, ln_power)"),
+    "amplitudes": ("f,amplitude\n0.4,3\n0.8,7\n", "square them"),
+    "kHz": ("frequency_kHz,power\n0.4,3\n0.8,7\n", "give frequencies in Hz"),
+    "logarithm of the frequency": ("log10_f,power\n0.4,3\n0.8,7\n", "give frequencies in Hz"),
+    "sigma of dB": ("f,power_dB,sigma\n0.4,3,1\n0.8,7,1\n", "sigma belongs to a power as it is"),
+    "no logarithm": ("f,power_dB\n0.4,3\n0.8,inf\n", "line 3: inf is no power in dB"),
     "empty": ("", "is empty"),
     "blank": (" \n\n", "is empty"),
     "comments only": ("# nothing\n", "holds no data"),

@@ -14,6 +14,7 @@ from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_files import KINDS
 from ._target import Target, load_target
+from ._target_csv import NAMES, column_role
 from ._text_tables import TEXT, beginning, cells_of, is_number
 from ._trials import Trials, load_recordings
 
@@ -128,8 +129,9 @@ def is_recording(path: str | os.PathLike[str]) -> bool:
         return False
     if all(is_number(name, delimiter) for name in names):
         return len(rows) > (POINTS if kind == ".csv" else ROWS)
-    spectral = any(
-        name.startswith(("freq", "proportional", "power")) or name in ("f", "hz") for name in names
+    # a column f beside a time is a force
+    spectral = {column_role(name)[0] for name in names} >= set(NAMES[:2]) or any(
+        name.startswith(("freq", "proportional", "power")) for name in names
     )
     # above the columns of a laboratory's text may stand a line "Frequency: 1000"
     if kind != ".csv":

@@ -118,7 +118,11 @@ def columns_of(points: Points, axis: str, file: str) -> tuple[Columns, bool]:
         result = Columns(columns[0], columns[1], None, points.places)
         check_columns(result, file, ordered=False)
     except TargetError as error:
-        hint = "; if the columns hold log10 of both, give axis='log-log' (--axis log-log)"
+        hint = (
+            "; if the columns hold log10 of both, give axis='log-log' (--axis log-log); if the"
+            " power alone is in dB or a logarithm, say so in a first line frequency_hz,power_dB or"
+            " frequency_hz,log10_power"
+        )
         hint = hint if np.any(points.x < 0) or np.all(points.y <= 0) else ""
         raise TargetError(f"{error}{hint}") from None
     return result, points.log_x

@@ -9,6 +9,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxmuscle._common.bundled import bundled_text, list_targets
 from jaxmuscle._common.documents import Table, checked, parsed, says
@@ -49,6 +50,9 @@ METADATA = (
 KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "stiffness", "measured", "settings")
 QUANTITIES, PROVENANCES = ("one of " + ", ".join(get_args(kind)) for kind in (Quantity, Provenance))
 POSITIVES = "numbers, each above 0"
+# In bins: as far beyond the first and the last frequency the power of a bin is that of the end; and
+# how far apart frequencies may be if the powers of all bins between them are to follow.
+REACH, COARSE = 0.1, 1.1
 
 
 class Raw(NamedTuple):
@@ -128,10 +132,11 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, str, str]:
 
 
 def _parse_csv(text: str, file: str, axis: str) -> Raw:
-    (columns, has_header, comment), path = read_csv(text, file), Path(file)
+    (columns, has_header, comment, notices), path = read_csv(text, file), Path(file)
     if not has_header:
         points = Points(columns.frequency, columns.power, columns.places)
-        return _digitised(points, file, axis, comment or path.name)
+        raw = _digitised(points, file, axis, comment or path.name)
+        return raw._replace(notices=[*raw.notices, *notices])
     _linear(axis, file)
     check_columns(columns, file, ordered=True)
     fields = {
@@ -139,7 +144,7 @@ def _parse_csv(text: str, file: str, axis: str) -> Raw:
         "source": comment or printable(path.name),
         "settings": SpectrumSettings(),
     }
-    return Raw(file, fields, columns, [])
+    return Raw(file, fields, columns, notices)
 
 
 def _linear(axis: str, file: str) -> None:
@@ -412,8 +417,13 @@ def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
         raise TargetError("trial_power: needs frequencies that lie on the bins of the settings")
     else:
         every = np.arange(first, last + 1)
-        low, high = position[0] - tolerance[0], position[-1] + tolerance[-1]
-        covered = every[(every >= low) & (every <= high)]
+        covered, lost = _between(every, position, np.maximum(tolerance, REACH))
+        if lost:
+            notices.append(
+                f"{lost} bins lie farther than half a bin from any frequency, between two that"
+                f" are more than {COARSE:g} bins apart: they are left out, as interpolated powers"
+                " are no measurements"
+            )
         logs = [np.log(values) for values in (columns.power, columns.sigma) if values is not None]
         at, known = (
             (np.log(covered), np.log(position)) if raw.log_frequency else (covered, position)
@@ -434,6 +444,20 @@ def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
             f" to {settings.frequency[-1]:.4g} Hz), at least 2 are needed; frequencies are in Hz"
         )
     return points, notices
+
+
+def _between(
+    every: Int[np.ndarray, " bins"],
+    position: Float[np.ndarray, " rows"],
+    reach: Float[np.ndarray, " rows"],
+) -> tuple[Int[np.ndarray, " covered"], int]:
+    """The bins between the first and the last frequency, and how many of them were left out because
+    no frequency is near: one number is not to count as two."""
+    bins = every[(every >= position[0] - reach[0]) & (every <= position[-1] + reach[-1])]
+    right = np.clip(np.searchsorted(position, bins), 1, max(position.size - 1, 1))
+    low, high = position[right - 1], position[np.minimum(right, position.size - 1)]
+    known = (high - low <= COARSE) | (np.minimum(np.abs(bins - low), np.abs(bins - high)) <= 0.5)
+    return bins[known], int(np.sum(~known))
 
 
 def _columns(rows: Any, inside: np.ndarray) -> list[list[float]]:

@@ -2,6 +2,8 @@
 
 const GRID_TOLERANCE = 0.02,
   PIXEL_TOLERANCE = 0.1,
+  REACH = 0.1,
+  COARSE = 1.1,
   NAMES = ["frequency_hz", "proportional_power", "sigma"];
 
 const numberIn = (cell, comma) => Number(comma ? cell.replace(",", ".") : cell);
@@ -83,9 +85,17 @@ function onBins(points, name, settings, segments, tolerance, notices) {
     if (found.length < points.length)
       notices.push(`${points.length - found.length} rows outside the bins ${first} to ${last} were left out.`);
   } else {
-    const low = position[0] - tolerance,
-      high = position[position.length - 1] + tolerance;
-    const covered = Array.from({ length: last - first + 1 }, (_, k) => first + k).filter((k) => k >= low && k <= high);
+    const low = position[0] - Math.max(tolerance, REACH),
+      high = position[position.length - 1] + Math.max(tolerance, REACH);
+    // One number is not to count as two: a bin needs a point nearby, or points no farther apart than bins.
+    const known = (k) => {
+      const right = Math.max(1, position.findIndex((x) => x >= k)),
+        [a, b] = k > position[position.length - 1] ? [k, k] : [position[right - 1], position[right]];
+      return b - a <= COARSE || Math.min(Math.abs(k - a), Math.abs(k - b)) <= 0.5;
+    };
+    const covered = Array.from({ length: last - first + 1 }, (_, k) => first + k).filter(
+      (k) => k >= low && k <= high && known(k),
+    );
     const between = (k, key) => {
       let i = position.findIndex((x) => x >= k);
       if (i === -1) return points[points.length - 1][key];
