@@ -313,9 +313,12 @@ def write_fit(
 def parts_of(path: Path) -> list[str]:
     """What the targets of an earlier result are called in the names of its files; nothing where
     there is none."""
+    from jaxmuscle._common.documents import parsed
+    from jaxmuscle._common.inputs import read_text
+
     try:
-        return list(file_names(json.loads(path.read_text(encoding="utf-8"))["parts"]).values())
-    except (OSError, ValueError, KeyError, TypeError):
+        return list(file_names(parsed(read_text(path), str(path), "JSON")["parts"]).values())
+    except (ValueError, KeyError, TypeError):
         return []
 
 

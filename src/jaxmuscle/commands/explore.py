@@ -1,8 +1,6 @@
 """`jaxmuscle explore`."""
 
-import json
 import tempfile
-import tomllib
 import webbrowser
 from pathlib import Path
 from typing import Annotated, Any
@@ -92,12 +90,10 @@ def _table(path: Path) -> dict[str, Any]:
     of these."""
     if path.suffix not in (".json", ".toml") or not path.is_file():
         return {}
-    try:
-        text = path.read_text(encoding="utf-8")
-        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except ValueError as error:
-        raise ValueError(f"{path}: is not valid {path.suffix[1:].upper()}: {error}") from None
-    return table if isinstance(table, dict) else {}
+    from jaxmuscle._common.documents import parsed
+    from jaxmuscle._common.inputs import read_text
+
+    return parsed(read_text(path), str(path), path.suffix[1:].upper())
 
 
 def _place(output: Path | None, *, force: bool) -> Path:
