@@ -9,7 +9,7 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import absent, aim_of, out, plain, record, reporting, task_of
+from .console import absent, aim_of, out, plain, record, reporting, spare, task_of
 from .options import Force, Json, Segments, TargetTask, TaskName
 
 
@@ -56,6 +56,8 @@ def explore(
         from jaxmuscle._common.files import write_text
 
         keep_compiled_programs()
+        if output is not None:
+            spare([what] if what else [], [output])
         model, target = _content(what, task, segments)
         text = jm.explorer.page(model, target)
         path = _place(output, force=force)
