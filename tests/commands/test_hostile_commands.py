@@ -81,6 +81,63 @@ def test_a_command_does_not_wait_for_a_pipe(command, tmp_path):
     refused(run(first, *before, path, *recordings, *out), f"{path}: is a named pipe; give ")
 
 
+NESTED = {
+    "tables.json": '{"a":' * 100_000,
+    "lists.json": "[" * 100_000,
+    "lists.toml": "a=" + "[" * 50_000,
+    "keys.toml": "a" + ".a" * 3000 + "=1",  # of 50 000 names tomllib makes 10 GB
+    "quoted.toml": '["a"' + " . 'a'" * 3000 + "]",
+    "inline.toml": 'a = {"\\"" = 1, ' + '"\\"".' * 3000 + "b = 1}",
+}
+# Of every command that reads JSON or TOML, what it reads of it.
+DOCUMENTS = {
+    "fit": (".json", ".toml"),
+    "compare": (".json", ".toml"),
+    "posterior": (".json", ".toml"),
+    "identifiability": (".json", ".toml"),
+    "explore": (".json", ".toml"),
+    "simulate": (".json", ".toml"),
+    "ensemble": (".json", ".toml"),
+    "speed": (".json", ".toml"),
+    "design": (".json", ".toml"),
+    "study": (".toml",),
+    "steadiness": (".toml",),
+}
+
+
+@pytest.mark.parametrize("file", NESTED)
+@pytest.mark.parametrize("command", DOCUMENTS)
+def test_a_nested_file_is_one_sentence(command, file, tmp_path):
+    path = tmp_path / file
+    if path.suffix not in DOCUMENTS[command]:
+        pytest.skip("not read by this command")
+    path.write_text(NESTED[file])
+    seeds = ["--seeds", 2] if command == "ensemble" else []
+    out = [] if command == "speed" else ["--out", tmp_path / "out.html"]
+    result = run(command, path, *seeds, *out)
+    refused(result, f"{path}: is nested too deeply")
+
+
+def test_a_nested_result_is_no_obstacle(tmp_path, monkeypatch):
+    """What an earlier fit.json says of other files, of which there may be none."""
+    monkeypatch.setattr(jm, "fit", lambda *_, **__: made_result())
+    (tmp_path / "fit.json").write_text(NESTED["tables.json"])
+    (tmp_path / "mine.csv").write_text(
+        "frequency_hz,proportional_power\n"
+        + "".join(f"{f},{p}\n" for f, p in zip(GRID, POWER, strict=True))
+    )
+    assert run("fit", tmp_path / "mine.csv", "--out", tmp_path, "--force").exit_code == 0
+
+
+@pytest.mark.parametrize("command", ["merge", "ensemble"])
+def test_a_nested_store_is_one_sentence(command, tmp_path):
+    path = tmp_path / "runs.zarr"
+    path.mkdir()
+    (path / "zarr.json").write_text(NESTED["tables.json"])
+    given = [path] if command == "merge" else ["zagrodny-slifkin", "--seeds", 2, "--out", path]
+    refused(run(command, *given, *["--resume"] * (command == "ensemble")), f"{path}: is not a sto")
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_reader_that_crashes_is_exit_code_2(tmp_path, monkeypatch):
     (tmp_path / "ezc3d.py").write_text("import os\ndef c3d(path):\n    os.abort()\n")

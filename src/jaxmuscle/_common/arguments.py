@@ -1,11 +1,15 @@
 """Numbers that a caller gives, checked: an error names the argument, its value and what is
 right."""
 
+import importlib.util
 import math
 import operator
 from typing import Any
 
 import numpy as np
+
+# of the extras that are asked for before the work begins
+EXTRAS = {"posterior": ("blackjax", "arviz_stats")}
 
 
 def is_real(value: Any) -> bool:
@@ -16,6 +20,15 @@ def is_real(value: Any) -> bool:
         return math.isfinite(value)
     except (TypeError, ValueError, OverflowError):
         return False
+
+
+def require_extra(extra: str) -> None:
+    """Raise an `ImportError` that says what to install, unless the modules of an extra of the
+    package are there."""
+    missing = [module for module in EXTRAS[extra] if importlib.util.find_spec(module) is None]
+    if missing:
+        needed = " and ".join(missing).replace("_", "-")
+        raise ImportError(f'{extra} needs {needed}: pip install "jaxmuscle[{extra}]"')
 
 
 def positive(name: str, value: Any, *, zero: bool = False) -> None:

@@ -23,6 +23,11 @@ WORDS = {
     "object": "a table",
     "array": "a list",
 }
+# A key of so many names is none of a file of ours, and tomllib takes room with the square of them.
+DEEPEST = 32
+KEY = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
+DEEP = re.compile(rf"(?<![\w\\-])(?:{KEY}\.[ \t]*+){{{DEEPEST}}}")
+NESTED = "is nested too deeply to be anything that jaxmuscle writes"
 DISAGREE = 1e-9  # relative; numbers that follow from others may be rounded differently
 
 T = TypeVar("T")
@@ -42,10 +47,12 @@ def says(meaning: str, *, missing: str | None = None, kind: str | None = None) -
 def parsed(text: str, file: str, kind: str, error: type[ValueError] = ValueError) -> dict[str, Any]:
     """The table of a JSON or TOML text (`kind`). Raises `error`, naming the file, also for a key
     that is there twice."""
+    if kind != "JSON" and DEEP.search(text):
+        raise error(f"{file}: {NESTED}")
     try:
         table = _json(text) if kind == "JSON" else tomllib.loads(text)
     except RecursionError:
-        raise error(f"{file}: is nested too deeply to be anything that jaxmuscle writes") from None
+        raise error(f"{file}: {NESTED}") from None
     except ValueError as wrong:
         raise error(f"{file}: is not valid {kind}: {_line(str(wrong))}") from None
     if not isinstance(table, dict):
@@ -75,7 +82,7 @@ def checked(
     except msgspec.ValidationError as wrong:
         raise error(f"{file}: {_in_words(_located(table, kind, str(wrong)))}") from None
     except RecursionError:
-        raise error(f"{file}: is nested too deeply to be anything that jaxmuscle writes") from None
+        raise error(f"{file}: {NESTED}") from None
 
 
 def converted(value: Any, kind: Any, where: str, error: type[ValueError] = ValueError) -> Any:

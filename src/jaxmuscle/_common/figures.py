@@ -19,6 +19,11 @@ UNDATED: dict[str, dict[str, Any]] = {
 }
 
 
+def figure_files(*names: str) -> list[str]:
+    """The files of these figures, in all formats."""
+    return [f"{name}.{kind}" for name in names for kind in FORMATS]
+
+
 def pixels_of(figure: Any) -> bytes:
     """A figure as PNG, to be drawn once and shown in several places."""
     import matplotlib

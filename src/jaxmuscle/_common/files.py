@@ -15,17 +15,25 @@ SYNCED_AT_ONCE = 32
 
 
 @contextlib.contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | Path, *, room: int = 0) -> Iterator[Path]:
     """A temporary path in the same folder that takes the place of `path` when the block ends
-    without an exception."""
+    without an exception. An `OSError`, of a full disk say, names `path`.
+
+    `room`: how many bytes the disk must have, for HDF5, which crashes where it has not.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem[:40]}-{secrets.token_hex(6)}{path.suffix}")
-    # with the umask's mode; to ask for the umask means to set it, for all threads
-    temporary.touch(exist_ok=False)
     try:
+        # with the umask's mode; to ask for the umask means to set it, for all threads
+        temporary.touch(exist_ok=False)
+        if room and hasattr(os, "posix_fallocate"):
+            with temporary.open("r+b") as file:
+                os.posix_fallocate(file.fileno(), 0, room)
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -6,14 +6,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .console import (
+    SPECTRUM,
     absent,
     csv_text,
     err,
     keep_other_spectrum,
     out,
     plain,
+    plain_lines,
     record,
     reporting,
+    say_written,
+    spare,
     writable,
 )
 from .options import (
@@ -106,9 +110,18 @@ def analyse(
                 " .toml"
             )
         if save_target is not None:
+            spare(paths, [save_target])
             absent(save_target, force=force)
         moved = perturbed(reading)
-        writable(output, "analysis.json", *["response.csv"] * moved, force=force, reads=paths)
+        writable(
+            output,
+            "analysis.json",
+            *["response.csv"] * moved,
+            beside=[SPECTRUM] * (not moved),
+            figures=["analysis"],
+            reads=paths,
+            force=force,
+        )
         if moved:
             if save_target is not None or mvc is not None:
                 raise ValueError(
@@ -217,14 +230,14 @@ def _write(
             highlight=False,
         )
     if whole:
-        out.print(plain(target), highlight=False)
-    written = [f"{folder}/analysis.json, spectrum.csv", *figures]
+        out.print(plain_lines(target), highlight=False)
+    written = ["analysis.json", "spectrum.csv", *figures]
     if target is not None and save_target is not None:
         save_target.parent.mkdir(parents=True, exist_ok=True)
         target.save(save_target)
         written.append(str(save_target))
     record(found)
-    out.print(f"Written: {', '.join(written)}", highlight=False)
+    say_written(folder, *written)
 
 
 def _write_perturbed(
@@ -254,7 +267,7 @@ def _write_perturbed(
         },
     }
     write_json(folder / "analysis.json", found)
-    out.print(plain(recording), highlight=False)
+    out.print(plain_lines(recording), highlight=False)
     for line in str(response).splitlines():
         if line.startswith(("  gain", "  phase", "  coherence")):
             out.print(plain(line), highlight=False)
@@ -282,7 +295,4 @@ def _write_perturbed(
             highlight=False,
         )
     record(found)
-    out.print(
-        f"Written: {folder}/{', '.join(['analysis.json', 'response.csv', *figures])}",
-        highlight=False,
-    )
+    say_written(folder, "analysis.json", "response.csv", *figures)

@@ -18,11 +18,14 @@ from .console import (
     BAD_INPUT,
     CONVERGED,
     NOT_CONVERGED,
+    REACHED,
     csv_text,
     err,
+    fit_files,
     out,
     plain,
     record,
+    say_written,
     writable,
     write_fit,
 )
@@ -71,9 +74,12 @@ def fit_together(
         name: folder / place
         for name, place in file_names((t.name for t in targets), taken=FILES).items()
     }
-    writable(
-        folder, "cohort.csv", *(f"{place.name}/fit.json" for place in places.values()), force=force
-    )
+    fits = [f"{place.name}/fit.json" for place in places.values()]
+    beside = [
+        f"{place.name}/{file}" for place in places.values() for file in (REACHED, *fit_files(place))
+    ]
+    reads = names if groups is None else [*names, groups]
+    writable(folder, "cohort.csv", *fits, beside=[*FILES, *beside], reads=reads, force=force)
     with told(True, f"fitting {len(targets)} targets") as tell:
         found = jm.fit_cohort(
             targets,
@@ -202,9 +208,7 @@ def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None
                 f" {plain(places[name])}"
             )
             err.print(f"[yellow]notice:[/] {words}", highlight=False)
-    out.print(
-        f"Written: {folder}/cohort.csv, {REPORT} and a folder for each target", highlight=False
-    )
+    say_written(folder, "cohort.csv", f"{REPORT} and a folder for each target")
 
 
 def _cell(estimate: Any) -> str:

@@ -16,8 +16,10 @@ from .console import (
     csv_text,
     out,
     plain,
+    plain_lines,
     record,
     reporting,
+    say_written,
     writable,
 )
 from .options import (
@@ -95,12 +97,20 @@ def compare(
             if Path(target).name == FIT
             else aim_of(target, task, read)
         )
-        writable(output, "compare.json", force=force)
+        writable(
+            output,
+            "compare.json",
+            beside=["compare.csv"],
+            figures=["compare"],
+            reads=[target],
+            force=force,
+        )
         with told(True, f"comparing models on {aim.name}") as tell:
             found = jm.compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
         files = _write(found, output, formats_of(formats))
         record(output / "compare.json")
-        _show(found, f"{output}/{', '.join(files)}")
+        _show(found)
+        say_written(output, *files)
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)
 
 
@@ -149,10 +159,9 @@ def _unsettled(found: "Comparison") -> str:
     )
 
 
-def _show(found: "Comparison", files: str) -> None:
-    out.print(plain(found), highlight=False, soft_wrap=True)
+def _show(found: "Comparison") -> None:
+    out.print(plain_lines(found), highlight=False, soft_wrap=True)
     if not found.success:
         out.print(
             f"[bold red]failed:[/] {plain(_unsettled(found))}", highlight=False, soft_wrap=True
         )
-    out.print(f"Written: {files}", highlight=False)

@@ -16,17 +16,19 @@ import typer
 from rich.console import Console
 
 import jaxmuscle as jm
+from jaxmuscle._common.files import expanded
 from jaxmuscle._common.names import file_names
 from jaxmuscle._common.progress import told
+from jaxmuscle._common.tables import harmless
 
 from .options import SAME_NAME, Observed, TaskName, fixed_values, names_in
-from .signals import interrupted, stays
+from .signals import BAD_INPUT, interrupted, stays
 
 if TYPE_CHECKING:
     from jaxmuscle.fits import FitInterrupted, FitResult
 
 
-CONVERGED, NOT_CONVERGED, BAD_INPUT = 0, 1, 2
+CONVERGED, NOT_CONVERGED = 0, 1
 REACHED = "reached.toml"
 
 out = Console(soft_wrap=False)
@@ -77,9 +79,8 @@ def reporting(as_json: bool = False) -> Iterator[None]:
     out.quiet = as_json
     try:
         yield
-    except (ValueError, OSError) as error:
-        said = _words(error).replace("\n", "\\n")  # of a file's name: a mistake is one line
-        err.print(f"[bold red]error:[/] {plain(said)}", highlight=False)
+    except (ValueError, OSError, ImportError) as error:
+        err.print(f"[bold red]error:[/] {plain(_words(error))}", highlight=False)
         raise typer.Exit(BAD_INPUT) from None
     except SimulationError as error:
         err.print(f"[bold red]failed:[/] {plain(error)}", highlight=False)
@@ -122,16 +123,27 @@ def _as_options(message: str) -> str:
 
 
 def plain(text: object) -> str:
-    """Text without markup, each control character and half character as its escape: a file may be
-    called anything."""
+    """Text without markup, on one line: each control character and half character as its escape,
+    since a file may be called anything."""
     whole = (
         str(text).encode("utf-8", "backslashreplace").decode().replace("\N{NO-BREAK SPACE}", " ")
     )
     shown = "".join(
-        sign if sign.isprintable() or sign == "\n" else sign.encode("unicode_escape").decode()
-        for sign in whole
+        sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in whole
     )
     return shown.replace("[", r"\[")
+
+
+def plain_lines(text: object) -> str:
+    """`plain` text of several lines."""
+    return "\n".join(map(plain, str(text).split("\n")))
+
+
+def say_written(folder: Path, *names: str) -> None:
+    """Say which files a command has put into its folder."""
+    out.print(
+        f"Written: {plain(folder)}/{', '.join(map(plain, names))}", highlight=False, soft_wrap=True
+    )
 
 
 def show(result: object, *, success: bool) -> None:
@@ -140,25 +152,37 @@ def show(result: object, *, success: bool) -> None:
     out.print(
         f"[{'green' if success else 'bold red'}]{plain(first)}[/]", highlight=False, soft_wrap=True
     )
-    out.print(plain("\n".join(rest)), highlight=False, soft_wrap=True)
+    out.print("\n".join(map(plain, rest)), highlight=False, soft_wrap=True)
 
 
 SPECTRUM = "spectrum.csv"  # of several commands
 
 
-def writable(folder: Path, *results: str, force: bool = False, reads: Iterable[str] = ()) -> None:
+def writable(
+    folder: Path,
+    *results: str,
+    beside: Iterable[str],
+    figures: Iterable[str] = (),
+    reads: Iterable[str | Path],
+    force: bool,
+) -> None:
     """Fail before the long work, not after it: also where one of the results is there already,
     unless it may go.
 
-    What the command itself `reads` is never replaced.
+    `beside`: all other files that the command replaces or removes; `figures`: those in any format,
+    by their names. What it `reads` is none of these.
     """
+    from jaxmuscle._common.figures import figure_files
+
+    for path in (folder, *folder.parents):
+        if path.is_symlink() and not path.exists():
+            raise ValueError(
+                f"--out {folder}: {path} is a link to {path.readlink()}, which is not there; make"
+                " that folder, or give another"
+            )
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {folder}: is a file; give the name of a folder")
-    for name in reads:
-        if Path(name).resolve() in [(folder / result).resolve() for result in (*results, SPECTRUM)]:
-            raise ValueError(
-                f"--out {folder}: the result would replace {name}, the input: give another folder"
-            )
+    spare(reads, (folder / name for name in (*results, *beside, *figure_files(*figures))))
     absent(*(folder / name for name in results), force=force)
     folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK | os.X_OK):
@@ -166,6 +190,26 @@ def writable(folder: Path, *results: str, force: bool = False, reads: Iterable[s
             f"--out {folder}: you may not write there; give another folder, or change its"
             " permissions"
         )
+
+
+def spare(reads: Iterable[str | Path], paths: Iterable[Path]) -> None:
+    """Raise a `ValueError` if a path that is to be replaced is one of the files that are read, or a
+    folder around one."""
+    replaced = {_identity(path) for path in paths} - {None}
+    for name in reads:
+        given = Path(os.path.realpath(expanded(name)))
+        if given.exists() and not replaced.isdisjoint(map(_identity, (given, *given.parents))):
+            raise ValueError(
+                f"the result would replace {name}, an input: write it to another place"
+            )
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What tells a file from all others, by whatever name; None where there is none."""
+    with contextlib.suppress(OSError, ValueError):
+        found = path.stat()
+        return found.st_dev, found.st_ino
+    return None
 
 
 def absent(*results: Path, force: bool) -> None:
@@ -210,7 +254,7 @@ def csv_text(columns: dict[str, Any]) -> str:
 
 def _field(value: Any) -> str:
     if value is None or isinstance(value, str | bool):
-        return "" if value is None else str(value)
+        return "" if value is None else harmless(str(value))
     return f"{value:.8g}"
 
 
@@ -221,6 +265,13 @@ def write_reached(stop: "FitInterrupted", folder: Path) -> None:
         folder / REACHED, stop.tasks[0], description="where a fit stood when it was interrupted"
     )
     stays(f"the best parameters so far are in {folder / REACHED}")
+
+
+def fit_unless_taken_up(folder: Path, target: str) -> list[str]:
+    """fit.json as a result of `fit_into`; nothing where the target is that file, which then
+    stays."""
+    there = _identity(folder / "fit.json")
+    return [] if there is not None and there == _identity(Path(target)) else ["fit.json"]
 
 
 def fit_into(
@@ -236,7 +287,7 @@ def fit_into(
         write_reached(stop, folder)
         stop.result.save(folder / "fit.json")
         remove(folder, REACHED)
-        err.print(f"the fit is not finished; what it had reached is in {folder}/fit.json")
+        err.print(f"the fit is not finished; what it had reached is in {plain(folder)}/fit.json")
         raise
     if not result.success:
         err.print(
@@ -244,7 +295,8 @@ def fit_into(
             highlight=False,
         )
         raise typer.Exit(NOT_CONVERGED)
-    result.save(folder / "fit.json")
+    if fit_unless_taken_up(folder, target):
+        result.save(folder / "fit.json")
     remove(folder, REACHED)
     return result
 
@@ -282,19 +334,13 @@ def write_fit(
 ) -> list[str]:
     """fit.json, fit in each of the formats, tables, a report if it is wanted, each whole or not
     there; their names."""
-    from jaxmuscle._common.figures import remove_figures, write_figure
+    from jaxmuscle._common.figures import write_figure
     from jaxmuscle._common.files import remove, write_text
     from jaxmuscle.reports import REPORT, fit_report
 
     tables = fit_tables(result)
-    earlier = [
-        f"{table}-{name}.csv"
-        for name in parts_of(folder / "fit.json")
-        for table in ("spectrum", "stiffness")
-    ]
     keep_other_spectrum(folder, next(iter(result.parts.values())).columns())
-    remove(folder, *tables, *earlier, REPORT)
-    remove_figures(folder, "fit")
+    remove(folder, *fit_files(folder, result.parts))
     result.save(folder / "fit.json")
     remove(folder, REACHED)
     for name, columns in tables.items():
@@ -310,12 +356,27 @@ def write_fit(
     return written
 
 
+def fit_files(folder: Path, parts: Iterable[str] = ()) -> list[str]:
+    """The files, beside fit.json, of a fit of these targets (where they are several) and of an
+    earlier one."""
+    from jaxmuscle._common.figures import figure_files
+    from jaxmuscle.reports import REPORT
+
+    called = ["", *(f"-{name}" for name in file_names(parts).values())]
+    called += [f"-{name}" for name in parts_of(folder / "fit.json")]
+    tables = [f"{table}{which}.csv" for which in called for table in ("spectrum", "stiffness")]
+    return [*tables, REPORT, *figure_files("fit")]
+
+
 def parts_of(path: Path) -> list[str]:
     """What the targets of an earlier result are called in the names of its files; nothing where
     there is none."""
+    from jaxmuscle._common.documents import parsed
+    from jaxmuscle._common.inputs import read_text
+
     try:
-        return list(file_names(json.loads(path.read_text(encoding="utf-8"))["parts"]).values())
-    except (OSError, ValueError, KeyError, TypeError):
+        return list(file_names(parsed(read_text(path), str(path), "JSON")["parts"]).values())
+    except (ValueError, KeyError, TypeError):
         return []
 
 

@@ -7,7 +7,7 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import out, plain, record, reporting, writable
+from .console import out, plain_lines, record, reporting, say_written, writable
 from .options import Force, Formats, Json, Output, Seed, band_of, formats_of, names_in
 
 
@@ -116,7 +116,15 @@ def design(
                 f"--error {error:g}: give a percentage between 0 and 100, as --error 10"
             )
         keep_compiled_programs()
-        writable(output, "motor.csv", "design.json", force=force)
+        writable(
+            output,
+            "motor.csv",
+            "design.json",
+            beside=(),
+            figures=["design"],
+            reads=[source],
+            force=force,
+        )
         found = jm.design_input(
             _source(source),
             names_in(quantity, "--quantity") or (),
@@ -136,11 +144,8 @@ def design(
         found.save(output / "design.json")
         figures = write_figure(found.plot(), output, "design", formats_of(formats))
         record(output / "design.json")
-        out.print(plain(found), highlight=False, soft_wrap=True)
-        out.print(
-            f"Written: {output}/{', '.join(['motor.csv', 'design.json', *figures])}",
-            highlight=False,
-        )
+        out.print(plain_lines(found), highlight=False, soft_wrap=True)
+        say_written(output, "motor.csv", "design.json", *figures)
         begin, end = found.window
         period = found.lengthening.seconds
         out.print(

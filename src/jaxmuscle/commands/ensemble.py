@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -12,7 +13,7 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import NOT_CONVERGED, err, out, record, reporting, task_of
+from .console import NOT_CONVERGED, err, out, plain, record, reporting, spare, task_of
 from .options import Force, Increments, Json, Observe, OtherTask, Preset, Seed
 
 if TYPE_CHECKING:
@@ -160,6 +161,8 @@ def ensemble(
         if part is None and (together or jm.ensembles.launched()):
             jm.ensembles.join(coordinator, processes, process_id)
         keep_compiled_programs()
+        if force:
+            spare([preset], [Path(output.removeprefix("file://"))])
         model = task_of(preset, task, observe)
         settings = {
             "duration": duration,
@@ -194,10 +197,8 @@ def run(
     there = jm.ensembles.attributes_of(output) if settings["resume"] else None
     before = there is not None and there.get("complete")
     if settings["resume"] and part is None and first and not before:
-        err.print(
-            f"{output}: {'there is no store yet, starting one' if there is None else 'resuming'}",
-            highlight=False,
-        )
+        doing = "there is no store yet, starting one" if there is None else "resuming"
+        err.print(f"{plain(output)}: {doing}", highlight=False)
     begun = time.monotonic()
     with watching(f"{seeds} seeds", first=first) as tell:
         kept: Any = {"reduce": True} if reduce else {}
@@ -216,7 +217,7 @@ def run(
                 "the same command again" if part is not None else "the same command with --resume"
             )
             err.print(
-                f"what is complete stays in {output}: {again} goes on",
+                f"what is complete stays in {plain(output)}: {again} goes on",
                 highlight=False,
                 soft_wrap=True,
             )
@@ -239,7 +240,7 @@ def run(
         if before
         else f"Written: {output} in {elapsed:.1f} s"
     )
-    out.print(said, highlight=False, soft_wrap=True)
+    out.print(plain(said), highlight=False, soft_wrap=True)
     return not failed
 
 
@@ -253,7 +254,7 @@ def say_part(found: "PartReport", output: str, elapsed: float) -> bool:
             f" all parts are done: jaxmuscle merge {output}"
         )
     say_failed(found.failed.tolist())
-    out.print(said, highlight=False, soft_wrap=True)
+    out.print(plain(said), highlight=False, soft_wrap=True)
     return found.success
 
 
@@ -299,7 +300,7 @@ def merge(
         record({"event": "done", "out": store, "failed": failed})
         say_store("", found, failed)
         out.print(
-            f"{store}: was complete, nothing to do" if before else f"Merged: {store}",
+            plain(f"{store}: was complete, nothing to do" if before else f"Merged: {store}"),
             highlight=False,
             soft_wrap=True,
         )

@@ -1,8 +1,6 @@
 """`jaxmuscle explore`."""
 
-import json
 import tempfile
-import tomllib
 import webbrowser
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +9,7 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import absent, aim_of, out, plain, record, reporting, task_of
+from .console import absent, aim_of, out, plain, record, reporting, spare, task_of
 from .options import Force, Json, Segments, TargetTask, TaskName
 
 
@@ -58,6 +56,8 @@ def explore(
         from jaxmuscle._common.files import write_text
 
         keep_compiled_programs()
+        if output is not None:
+            spare([what] if what else [], [output])
         model, target = _content(what, task, segments)
         text = jm.explorer.page(model, target)
         path = _place(output, force=force)
@@ -92,12 +92,10 @@ def _table(path: Path) -> dict[str, Any]:
     of these."""
     if path.suffix not in (".json", ".toml") or not path.is_file():
         return {}
-    try:
-        text = path.read_text(encoding="utf-8")
-        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except ValueError as error:
-        raise ValueError(f"{path}: is not valid {path.suffix[1:].upper()}: {error}") from None
-    return table if isinstance(table, dict) else {}
+    from jaxmuscle._common.documents import parsed
+    from jaxmuscle._common.inputs import read_text
+
+    return parsed(read_text(path), str(path), path.suffix[1:].upper())
 
 
 def _place(output: Path | None, *, force: bool) -> Path:

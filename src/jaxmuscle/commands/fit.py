@@ -13,13 +13,16 @@ from jaxmuscle._common.progress import told
 from .console import (
     CONVERGED,
     NOT_CONVERGED,
+    REACHED,
     aim_of,
     aimed,
     err,
+    fit_files,
     out,
     plain,
     record,
     reporting,
+    say_written,
     show,
     writable,
     write_fit,
@@ -306,7 +309,8 @@ def fit(
                 "seeds": 0 if quick else seeds or 32,
             }
             given = read_with_holds(target, hold, reading, window)
-            writable(output, "fit.json", force=force, reads=[*target, *hold])
+            beside = [REACHED, *fit_files(output, ("moved", "held"))]
+            writable(output, "fit.json", beside=beside, reads=[*target, *hold], force=force)
             if rung is not None:
                 bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
                 options["tasks"] = {name: jm.on_rung(base, rung) for name, base in bases.items()}
@@ -323,7 +327,8 @@ def fit(
                 if recorded
                 else _aim_at_spectrum(target[0], reading, window, task, read)
             )
-            writable(output, "fit.json", force=force, reads=target)
+            beside = [REACHED, *fit_files(output)]
+            writable(output, "fit.json", beside=beside, reads=target, force=force)
             if rung is not None:
                 model = jm.on_rung(model, rung)
             converged = _fit_alone(seen, model, output, options, figures, everything=everything)
@@ -486,7 +491,7 @@ def _fit_one(
             write_reached(stop, folder)
         write_fit(stop.result, folder)
         record(folder / "fit.json")
-        err.print(f"interrupted: what had been reached is in {folder}")
+        err.print(f"interrupted: what had been reached is in {plain(folder)}")
         raise typer.Exit(interrupted()) from None
     except KeyboardInterrupt:
         if printed:
@@ -511,7 +516,7 @@ def _fit_one(
             "The checks moved the last digits a little: cite the numbers in the files.",
             highlight=False,
         )
-    out.print(f"Written: {folder}/{', '.join(files)}", highlight=False, soft_wrap=True)
+    say_written(folder, *files)
     return result.success
 
 

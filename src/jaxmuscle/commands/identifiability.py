@@ -7,7 +7,18 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import fit_into, out, plain, record, reporting, writable
+from .console import (
+    REACHED,
+    fit_into,
+    fit_unless_taken_up,
+    out,
+    plain,
+    plain_lines,
+    record,
+    reporting,
+    say_written,
+    writable,
+)
 from .options import Force, Formats, Json, Output, Quantity, Seed, Segments, TargetTask, formats_of
 
 
@@ -45,8 +56,15 @@ def identifiability(
         from jaxmuscle._common.figures import write_figure
 
         keep_compiled_programs()
-        taken_up = Path(target).resolve() == (output / "fit.json").resolve()
-        writable(output, *["fit.json"] * (not taken_up), "identifiability.json", force=force)
+        writable(
+            output,
+            *fit_unless_taken_up(output, target),
+            "identifiability.json",
+            beside=[REACHED],
+            figures=["identifiability"],
+            reads=[target],
+            force=force,
+        )
         asked = {"task": task, "noise": None, "free": None, "fix": None}
         found = jm.identifiability(
             fit_into(output, target, {"segments": segments, "quantity": quantity}, asked, seed)
@@ -54,16 +72,14 @@ def identifiability(
         found.save(output / "identifiability.json")
         figures = write_figure(found.plot(), output, "identifiability", formats_of(formats))
         record(output / "identifiability.json")
-        out.print(plain(found), highlight=False, soft_wrap=True)
-        out.print(
-            f"Written: {output}/{', '.join(['identifiability.json', *figures, 'fit.json'])}",
-            highlight=False,
-        )
+        out.print(plain_lines(found), highlight=False, soft_wrap=True)
+        say_written(output, "identifiability.json", *figures, "fit.json")
         stiffness = found.present.quantities.get("K_w0")
         if stiffness is not None and not stiffness.determined:
+            fitted = plain(output / "fit.json")
             out.print(
                 "How long must a record with a moved insertion be? For a standard error of 10 %,"
-                f" beginning with a flat motion, ask: jaxmuscle design {output}/fit.json --quantity"
+                f" beginning with a flat motion, ask: jaxmuscle design {fitted} --quantity"
                 " K_w_tangent --error 10 --spread 1. Its errors hold if m_z is about what the"
                 " motor will move: first fit with your estimate in kg (--fix m_z=2.3, say), if you"
                 " have not done so",

@@ -11,8 +11,10 @@ from jaxmuscle._common.progress import told
 from .console import (
     CONVERGED,
     NOT_CONVERGED,
+    REACHED,
     err,
     fit_into,
+    fit_unless_taken_up,
     out,
     parts_of,
     plain,
@@ -92,12 +94,23 @@ def posterior(
         jaxmuscle posterior my-spectrum.csv --segments 12 --noise ornstein-uhlenbeck
     """
     with reporting(as_json):
+        from jaxmuscle._common.arguments import require_extra
         from jaxmuscle._common.environment import keep_compiled_programs
+        from jaxmuscle.reports import REPORT
 
+        require_extra("posterior")
         keep_compiled_programs()
-        taken_up = Path(target).resolve() == (output / "fit.json").resolve()
+        several = [output / "posterior.json", *[Path(target)] * target.endswith(".json")]
+        drawn = [f"predictive-{name}" for path in several for name in parts_of(path)]
         writable(
-            output, *["fit.json"] * (not taken_up), "posterior.nc", "posterior.json", force=force
+            output,
+            *fit_unless_taken_up(output, target),
+            "posterior.nc",
+            "posterior.json",
+            beside=[REACHED, REPORT],
+            figures=["corner", "predictive", "chains", *drawn],
+            reads=[target],
+            force=force,
         )
         asked = {
             "task": task,
@@ -111,11 +124,10 @@ def posterior(
                 found = jm.posterior(
                     result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell
                 )
-        except ImportError as error:
-            raise ValueError(str(error)) from None
         except KeyboardInterrupt:
+            folder = plain(output)
             err.print(
-                f"the fit stays: go on with jaxmuscle posterior {output}/fit.json --out {output}",
+                f"the fit stays: go on with jaxmuscle posterior {folder}/fit.json --out {folder}",
                 soft_wrap=True,
             )
             raise
@@ -150,9 +162,9 @@ def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
 def _show(found: "Posterior", folder: Path) -> None:
     if not found.success:
         err.print(
-            f"[bold red]failed:[/] {plain(found.message)}; the chains are in {folder}",
+            f"[bold red]failed:[/] {plain(found.message)}; the chains are in {plain(folder)}",
             highlight=False,
         )
         return
     show(found.summary(), success=True)
-    out.print(f"written to {folder}", highlight=False)
+    out.print(f"written to {plain(folder)}", highlight=False, soft_wrap=True)

@@ -234,10 +234,7 @@ def read(table: "Table", reading: dict[str, Any], edges: Any) -> Any:
 
 def table_of(path: "str | Table", reading: dict[str, Any]) -> "Table":
     """The columns of a file, which is read here alone."""
-    try:
-        return jm.data.read_table(path, reading["skip_rows"])
-    except ImportError as error:
-        raise ValueError(str(error)) from None
+    return jm.data.read_table(path, reading["skip_rows"])
 
 
 def require_files(names: Sequence[str]) -> None:

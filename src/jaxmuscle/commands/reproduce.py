@@ -8,8 +8,10 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle import paper
 
-from .console import out, record, reporting, writable
+from .console import out, record, reporting, say_written, writable
 from .options import Force, Json, Output
+
+FIGURES = ["fig2", "fig3", "fig4a", "fig4b", "fig5", "fig6a", "fig6b", "fig7", "fig8", "readings"]
 
 
 def reproduce(
@@ -41,7 +43,14 @@ def reproduce(
         from jaxmuscle._common.environment import keep_compiled_programs
 
         keep_compiled_programs()
-        writable(output, "claims.json", force=force)
+        writable(
+            output,
+            "claims.json",
+            beside=["index.html"],
+            figures=FIGURES,
+            reads=recording or (),
+            force=force,
+        )
         given = paper.given_recordings(recording) if recording else None
         _reproduce(output, given)
 
@@ -54,6 +63,4 @@ def _reproduce(folder: Path, given) -> None:
         if row.verdict == "does not agree":
             says = f"does not agree ({row.kind}): {row.says} ({row.source}): {row.ours}"
             out.print(says, highlight=False, markup=False)
-    out.print(
-        f"Written: {folder}/index.html, fig2 to fig8 (.png, .pdf), claims.json", highlight=False
-    )
+    say_written(folder, "index.html", "fig2 to fig8 (.png, .pdf)", "claims.json")

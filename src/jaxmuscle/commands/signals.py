@@ -18,8 +18,9 @@ import threading
 import time
 from collections.abc import Iterator
 from types import FrameType
-from typing import Any, NoReturn, TextIO
+from typing import Any, NoReturn
 
+BAD_INPUT = 2  # exit code, also where nothing can be printed
 LIMIT = 7.0  # seconds from the first signal to the end
 PATIENCE = 1.0  # a second signal so many seconds later ends the process at once
 SOON = 0.05
@@ -31,6 +32,7 @@ OURS = [number for number in (*ENDING, LATER) if number is not None]
 IMPORTS = "<frozen importlib"
 STAYS = "what had been written before stays"
 SHOW_CURSOR = "\x1b[?25h"  # a bar of rich has hidden it
+OUTPUT = "the output"  # what the error calls a stdout that cannot be written
 
 
 class Ear:
@@ -100,7 +102,7 @@ class Ear:
                 break
         with contextlib.suppress(OSError):
             cursor = SHOW_CURSOR if os.isatty(2) else ""
-            os.write(2, f"{cursor}interrupted: {self.stays}\n".encode())
+            os.write(2, f"{cursor}interrupted: {self.stays}\n".encode(errors="backslashreplace"))
         leave(self.code)
 
 
@@ -171,11 +173,13 @@ class Reader(io.RawIOBase):
     do.
 
     The signal itself stays ignored: it would also end us when a server or a process that we have
-    started closes its end.
+    started closes its end. What else may hinder it, as a full disk, is an error once, if it is
+    `needed`: Python would write what is left again at its end.
     """
 
-    def __init__(self, number: int):
+    def __init__(self, number: int, *, needed: bool):
         self.number = number
+        self.needed = needed
 
     def write(self, data: Any) -> int:
         try:
@@ -184,6 +188,11 @@ class Reader(io.RawIOBase):
             signal.signal(signal.SIGPIPE, signal.SIG_DFL)
             os.kill(os.getpid(), signal.SIGPIPE)
             raise
+        except OSError as error:
+            if self.needed:
+                self.needed = False
+                raise OSError(error.errno, error.strerror, OUTPUT) from None
+            return len(data)
 
     def writable(self) -> bool:
         return True
@@ -195,29 +204,46 @@ class Reader(io.RawIOBase):
         return os.isatty(self.number)
 
 
-def read_by(stream: TextIO | None) -> Any:
-    """The same stream, to a `Reader`."""
-    if stream is None or not hasattr(signal, "SIGPIPE"):
+def read_by(stream: Any, *, needed: bool) -> Any:
+    """The same stream, to a `Reader`; letters that it does not know are written as escapes."""
+    if not hasattr(signal, "SIGPIPE"):
+        stream.reconfigure(errors="backslashreplace")
         return stream
     return io.TextIOWrapper(
-        io.BufferedWriter(Reader(stream.fileno())),
+        io.BufferedWriter(Reader(stream.fileno(), needed=needed)),
         stream.encoding,
-        stream.errors,
+        "backslashreplace",
         line_buffering=True,
     )
+
+
+def open_closed() -> None:
+    """Let the standard streams that whoever started us has closed lead nowhere, before a file takes
+    the number of one of them and what is printed goes into it."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            number = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(number, True)
+            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115 (it stays open)
 
 
 @contextlib.contextmanager
 def heard() -> Iterator[None]:
     """What runs in it ends at a signal, with the exit code of that signal and without a
     traceback."""
+    open_closed()
     ear = Ear()
     ear.listen()
-    sys.stdout, sys.stderr = read_by(sys.stdout), read_by(sys.stderr)
+    sys.stdout, sys.stderr = read_by(sys.stdout, needed=True), read_by(sys.stderr, needed=False)
     try:
         yield
     except KeyboardInterrupt:
         ear.code = ear.code or 128 + signal.SIGINT
+    except OSError as error:
+        if error.filename != OUTPUT:
+            raise
+        print(f"error: {OUTPUT}: {error.strerror}", file=sys.stderr)
+        ear.code, ear.told = BAD_INPUT, True
     finally:
         ear.working = False
         if ear.code:

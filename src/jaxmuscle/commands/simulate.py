@@ -7,7 +7,17 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import csv_text, keep_other_spectrum, out, record, reporting, task_of, writable
+from .console import (
+    SPECTRUM,
+    csv_text,
+    keep_other_spectrum,
+    out,
+    record,
+    reporting,
+    say_written,
+    task_of,
+    writable,
+)
 from .options import Force, Formats, Json, Observe, OtherTask, Output, Preset, Seed, formats_of
 
 if TYPE_CHECKING:
@@ -42,7 +52,14 @@ def simulate(
 
         keep_compiled_programs()
         model = task_of(preset, task, observe)
-        writable(output, "trajectories.nc", force=force)
+        writable(
+            output,
+            "trajectories.nc",
+            beside=[SPECTRUM],
+            figures=["simulate"],
+            reads=[preset],
+            force=force,
+        )
         _simulate(model, seeds, seed, output, formats_of(formats))
 
 
@@ -60,7 +77,7 @@ def _simulate(
     estimate = runs.mean_spectrum()
     mean = estimate.spectrum
     dataset = runs.to_xarray().assign_attrs(seed=seed)
-    with replacing(folder / "trajectories.nc") as temporary:
+    with replacing(folder / "trajectories.nc", room=dataset.nbytes + 2**16) as temporary:
         dataset.to_netcdf(temporary, engine="h5netcdf")
     low, high = np.quantile(np.asarray(spectra.proportional), [0.05, 0.95], axis=0)
     columns = {
@@ -106,4 +123,4 @@ def _simulate(
         f"Spectrum: maximum at {found.maximum.frequency:.3f} Hz, local maxima at {locals_} Hz",
         highlight=False,
     )
-    out.print(f"Written: {folder}/{', '.join(files)}", highlight=False)
+    say_written(folder, *files)

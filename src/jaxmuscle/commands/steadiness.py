@@ -7,7 +7,7 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import out, plain, record, reporting, writable
+from .console import out, plain_lines, record, reporting, say_written, writable
 from .options import Force, Formats, Json, Output, Recordings, Window, band_of, formats_of
 from .recordings import read_trials, reads_recordings
 from .study import measured_study, write_study
@@ -62,17 +62,21 @@ def steadiness(
             return
         from jaxmuscle._common.figures import write_figure
         from jaxmuscle._common.files import write_text
+        from jaxmuscle._common.tables import csv_of
 
-        writable(output, "steadiness.json", force=force)
+        writable(
+            output,
+            "steadiness.json",
+            beside=["steadiness.csv"],
+            figures=["steadiness"],
+            reads=paths,
+            force=force,
+        )
         searched = None if band is None else band_of(band)
         found = jm.steadiness(read_trials(paths, reading, window), band=searched)
         found.save(output / "steadiness.json")
-        table = found.to_dataframe().to_csv(index=False, float_format="%.12g", lineterminator="\n")
-        write_text(output / "steadiness.csv", table)
+        write_text(output / "steadiness.csv", csv_of(found.to_dataframe()))
         figures = write_figure(found.plot(), output, "steadiness", formats_of(formats))
         record(output / "steadiness.json")
-        out.print(plain(found), highlight=False, soft_wrap=True)
-        out.print(
-            f"Written: {output}/{', '.join(['steadiness.json', 'steadiness.csv', *figures])}",
-            highlight=False,
-        )
+        out.print(plain_lines(found), highlight=False, soft_wrap=True)
+        say_written(output, "steadiness.json", "steadiness.csv", *figures)

@@ -7,7 +7,17 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import CONVERGED, NOT_CONVERGED, err, out, plain, record, reporting, show, writable
+from .console import (
+    CONVERGED,
+    NOT_CONVERGED,
+    err,
+    plain,
+    record,
+    reporting,
+    say_written,
+    show,
+    writable,
+)
 from .options import (
     READING,
     Force,
@@ -101,7 +111,7 @@ def study(
 
         keep_compiled_programs()
         span = edges_of(window)
-        writable(output, "study.json", force=force)
+        _writable(output, table, force=force)
         found = jm.run_study(
             table,
             rung=int(rung) if rung is not None and rung.isdigit() else rung,
@@ -134,8 +144,7 @@ def write_study(found: "StudyResult", output: Path, formats: list[str]) -> None:
     study_report(found, output)
     record(output / "study.json")
     show(found, success=found.success)
-    files = ", ".join(sorted(path.name for path in output.iterdir()))
-    out.print(f"Written: {output}/{files}", highlight=False, soft_wrap=True)
+    say_written(output, *sorted(path.name for path in output.iterdir()))
 
 
 def measured_study(
@@ -143,8 +152,22 @@ def measured_study(
 ) -> "StudyResult":
     """A study without any model."""
     span = edges_of(window)
-    writable(output, "study.json", force=force)
+    _writable(output, table, force=force)
     return jm.run_study(table, fit=False, progress=True, window=span, **_given(reading))
+
+
+def _writable(output: Path, table: str | Path, *, force: bool) -> None:
+    from jaxmuscle.reports import REPORT
+
+    beside = ["table1.csv", "people.csv", "differences.csv", "methods.txt", REPORT]
+    writable(
+        output,
+        "study.json",
+        beside=beside,
+        figures=["spectra", "quantities"],
+        reads=jm.data.files_of_study(table),
+        force=force,
+    )
 
 
 def _given(reading: dict[str, Any]) -> dict[str, Any]:

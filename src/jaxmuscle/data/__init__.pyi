@@ -14,6 +14,7 @@ from ._recording_quality import RecordingSummary as RecordingSummary
 from ._recording_table import Table as Table
 from ._steadiness import Steadiness as Steadiness
 from ._steadiness import steadiness as steadiness
+from ._study_table import files_of_study as files_of_study
 from ._study_table import is_study as is_study
 from ._target import Target as Target
 from ._target import load_target as load_target

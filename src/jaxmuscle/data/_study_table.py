@@ -204,11 +204,13 @@ class Row(NamedTuple):
 
 
 class StudyTable(NamedTuple):
-    """The recordings of a study, in order; the `options` that its file states; its `source`."""
+    """The recordings of a study, in order; the `options` that its file states; its `source`, and
+    the `files` that say all this."""
 
     rows: tuple[Row, ...]
     options: dict[str, Any]
     source: str
+    files: tuple[Path, ...] = ()
 
 
 class Cell(NamedTuple):
@@ -233,7 +235,7 @@ def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") ->
         return StudyTable(_checked(places, Path(), "the table"), {}, "a table in memory")
     path = expanded(study)
     if path.suffix.lower() != ".toml":
-        return StudyTable(_checked(_lines(path), path.parent, str(path)), {}, path.name)
+        return StudyTable(_checked(_lines(path), path.parent, str(path)), {}, path.name, (path,))
     stated = parsed(read_text(path, instead=TABLES), str(path), "TOML")
     checked(stated, StudyFile, str(path))
     options = {name: value for name, value in stated.items() if name in OPTIONS}
@@ -243,12 +245,25 @@ def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") ->
         )
     if "table" in stated:
         table = path.parent / expanded(stated["table"])
-        return StudyTable(_checked(_lines(table), table.parent, str(table)), options, path.name)
+        rows = _checked(_lines(table), table.parent, str(table))
+        return StudyTable(rows, options, path.name, (path, table))
     places = (
         (f"{path}: recording {number}", dict(row))
         for number, row in enumerate(stated["recordings"], 1)
     )
-    return StudyTable(_checked(places, path.parent, str(path)), options, path.name)
+    return StudyTable(_checked(places, path.parent, str(path)), options, path.name, (path,))
+
+
+def files_of_study(path: str | os.PathLike[str]) -> list[Path]:
+    """All files that the study at `path` reads: its own, the table that this one names, the
+    recordings.
+
+        jm.data.files_of_study("study.toml")
+
+    **Raises:** `ValueError` naming file, line and column, for a table that is no study.
+    """
+    found = read_study(path)
+    return [*found.files, *(row.file for row in found.rows)]
 
 
 def is_study(path: str | os.PathLike[str]) -> bool:

@@ -52,7 +52,7 @@ def require_intact(place: AbstractPlace, document: Document) -> None:
     try:
         made = json.loads(document["attributes"][CHECKSUM])
         intact = made["sha256"] == _digest(document, made["of"])
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         intact = False
     if not intact:
         raise StoreError(
@@ -138,7 +138,7 @@ def misdescribed(place: AbstractPlace, document: Document) -> list[str]:
 def _parsed(data: bytes | None) -> Any:
     try:
         return json.loads(data or b"")
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
 
 

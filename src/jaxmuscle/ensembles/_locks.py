@@ -45,7 +45,7 @@ class Holder(NamedTuple):
         """Who wrote this, None if nobody did."""
         try:
             return Holder(**json.loads(data or b""))
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, RecursionError):
             return None
 
     def to_bytes(self) -> bytes:

@@ -164,7 +164,7 @@ def _document(place: AbstractPlace) -> Document:
         if not isinstance(document["attributes"], dict):
             raise ValueError("no attributes")
         return document
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise StoreError(
             f"{place.name}: is not a store that jaxmuscle wrote, or its {ROOT} is damaged"
             f" ({error}); give another name"

@@ -23,7 +23,7 @@ from jaxmuscle._common.figures import remove_figures, write_figure
 from jaxmuscle._common.files import remove, write_json, write_text
 from jaxmuscle._common.keys import check_key
 from jaxmuscle._common.progress import Tell, told
-from jaxmuscle._common.tables import frame
+from jaxmuscle._common.tables import csv_of, frame
 from jaxmuscle._common.text import WIDTH, choices
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._measured import MEASURES
@@ -291,7 +291,7 @@ class StudyResult(Result, eqx.Module):
         }
         for name, rows in tables.items():
             if rows:
-                write_text(folder / name, frame(rows).to_csv(index=False, float_format="%.12g"))
+                write_text(folder / name, csv_of(frame(rows)))
         write_json(folder / "study.json", to_table(self))
         write_text(folder / "methods.txt", textwrap.fill(self.methods(), WIDTH) + "\n")
         for name, figure in self.figures().items():

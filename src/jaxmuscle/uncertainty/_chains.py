@@ -53,17 +53,13 @@ class _State(NamedTuple):
 
 def _tools() -> tuple[Any, Any, Any, Any]:
     """HMC and the class of its states, dual averaging and the class of its states."""
-    try:
-        import blackjax
-        from blackjax.adaptation.step_size import (
-            DualAveragingAdaptationState,
-            dual_averaging_adaptation,
-        )
-        from blackjax.mcmc.hmc import HMCState
-    except ImportError as error:
-        raise ImportError(
-            "posterior needs blackjax and arviz-stats: pip install blackjax arviz-stats"
-        ) from error
+    import blackjax
+    from blackjax.adaptation.step_size import (
+        DualAveragingAdaptationState,
+        dual_averaging_adaptation,
+    )
+    from blackjax.mcmc.hmc import HMCState
+
     return (
         blackjax.hmc,
         HMCState,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxmuscle._common.arguments import require_extra
 from jaxmuscle._common.environment import fitting, versions
 from jaxmuscle._common.keys import fold_in, number_of
 from jaxmuscle._common.programs import kept
@@ -85,6 +86,7 @@ def posterior(  # noqa: PLR0913 (options of a public call)
     **Source:** Neal 2011, arXiv:1206.1901 (Hamiltonian Monte Carlo, trajectories of random length);
     Vehtari et al. 2021, doi:10.1214/20-BA1221 (R-hat, effective sample size).
     """
+    require_extra("posterior")
     lengths = DRAWS if draws is None else (draws,)
     for name, count, least in (
         ("chains", chains, 2),

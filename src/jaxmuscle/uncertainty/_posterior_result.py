@@ -349,8 +349,9 @@ def datatree(found: Any) -> "xarray.DataTree":
 
 def write_netcdf(path: str | Path, found: Any) -> None:
     """Write the tree to a temporary file beside `path`, then rename it."""
-    with replacing(path) as temporary:
-        datatree(found).to_netcdf(temporary, engine="h5netcdf")
+    tree = datatree(found)
+    with replacing(path, room=tree.nbytes + 2**18) as temporary:
+        tree.to_netcdf(temporary, engine="h5netcdf")
 
 
 def summary_table(found: Any) -> dict[str, Any]:
