@@ -54,10 +54,8 @@ def explore(
         jaxmuscle explore out/fit/fit.json --out fit.html --no-open
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
         from jaxmuscle._common.files import write_text
 
-        keep_compiled_programs()
         model, target = _content(what, task, segments)
         text = jm.explorer.page(model, target)
         path = _place(output, force=force)

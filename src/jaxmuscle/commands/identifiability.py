@@ -41,10 +41,8 @@ def identifiability(
         jaxmuscle identifiability my-spectrum.csv --segments 12 --out out/next
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
         from jaxmuscle._common.figures import write_figure
 
-        keep_compiled_programs()
         taken_up = Path(target).resolve() == (output / "fit.json").resolve()
         writable(output, *["fit.json"] * (not taken_up), "identifiability.json", force=force)
         asked = {"task": task, "noise": None, "free": None, "fix": None}

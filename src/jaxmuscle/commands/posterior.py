@@ -92,9 +92,6 @@ def posterior(
         jaxmuscle posterior my-spectrum.csv --segments 12 --noise ornstein-uhlenbeck
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
-
-        keep_compiled_programs()
         taken_up = Path(target).resolve() == (output / "fit.json").resolve()
         writable(
             output, *["fit.json"] * (not taken_up), "posterior.nc", "posterior.json", force=force

@@ -97,9 +97,6 @@ def study(
         jaxmuscle study study.toml --correction fdr --quantities mean,tremor_frequency
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
-
-        keep_compiled_programs()
         span = edges_of(window)
         writable(output, "study.json", force=force)
         found = jm.run_study(
