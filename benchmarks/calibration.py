@@ -23,7 +23,6 @@ import numpy as np
 import scipy.stats
 
 import jaxmuscle as jm
-from jaxmuscle._common.environment import keep_compiled_programs
 from jaxmuscle._common.files import write_json
 from jaxmuscle.fits._search import search_together
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
@@ -231,7 +230,6 @@ def main() -> None:
     if given.merge:
         rows = [row for path in given.merge for row in json.loads(path.read_text())["rows"]]
     else:
-        keep_compiled_programs()
         given.out.parent.mkdir(parents=True, exist_ok=True)
         numbers = list(range(given.first, given.first + given.recordings))
         rows = run(numbers, given.seconds, given.out, (given.draws, given.warmup))

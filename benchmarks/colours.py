@@ -14,7 +14,6 @@ import numpy as np
 from run import machine, write
 
 import jaxmuscle as jm
-from jaxmuscle._common.environment import keep_compiled_programs
 from jaxmuscle.comparison._comparison import NEEDED, Evidence, decided, lowest
 from jaxmuscle.comparison._evidence import Candidate, Folds, held_out, masked_bins, maxima, stacked
 from jaxmuscle.model._noises import with_noise
@@ -230,7 +229,6 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=Path("out/colours.json"))
     options = parser.parse_args()
-    keep_compiled_programs()
     with jax.enable_x64(True):
         done = study(options.recordings, options.seconds, options.out.with_suffix(".part.json"))
     tables = {"noise": verdicts(done), "harmonic": harmonics(done)}

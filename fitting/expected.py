@@ -71,9 +71,6 @@ def levels() -> str:
 
 
 if __name__ == "__main__":
-    from jaxmuscle._common.environment import keep_compiled_programs
-
-    keep_compiled_programs()
     FOLDER.mkdir(exist_ok=True)
     for name in sys.argv[1:] or SCRIPTS:
         (FOLDER / f"{name}.json").write_text(

@@ -110,9 +110,9 @@ def _program(
         compiled := programs._load(folder / entry[0])
     ) is not None:
         return compiled, entry[1]
-    flat.__name__ = "kept_in_test"
+    flat.__name__ = programs._unknown("in_test")
     lowered = jax.jit(flat, keep_unused=True).lower(*leaves)
-    return programs._compiled(lowered, {OPTIMISATION: level}, place, tree), tree
+    return programs._compiled(lowered, {OPTIMISATION: level}, folder, place, tree).call, tree
 
 
 def keep_own_classes() -> None:

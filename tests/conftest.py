@@ -244,10 +244,7 @@ def pytest_collection_finish() -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     shapes.begin_anew()
-    # A command that ran here before keeps only what took long to compile (single operations would
-    # be compiled ever again), and `jaxmuscle speed` keeps nothing (all later tests would compile
-    # their own).
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    # After `jaxmuscle speed`, which keeps nothing: all later tests would compile their own.
     os.environ.pop("JAXMUSCLE_CACHE", None)
     if item.get_closest_marker("gpu") and jax.default_backend() != "gpu":
         pytest.skip("needs a GPU")

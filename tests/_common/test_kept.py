@@ -92,6 +92,55 @@ def test_a_damaged_file_is_made_again(x64, folder, damage):
     assert again.traces == 1
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        lambda name, shape: 5,
+        lambda name, shape: name,
+        lambda name, shape: (name, shape),
+        lambda name, shape: (5, shape, False),
+        lambda name, shape: ("another", shape, False),
+        lambda name, shape: ("null\0", shape, False),
+        lambda name, shape: (name, None, False),
+        lambda name, shape: (name, {"x": shape["x"]}, False),
+        lambda name, shape: (name, {"x": shape["base"], "base": shape["x"]}, False),
+    ],
+)
+def test_an_entry_that_is_something_else_is_made_again(x64, folder, content):
+    """Whole, with the digest that it must have."""
+    assert_right(Kept(solved)(TASK, MATRIX))
+    (place,) = [path for path in folder.rglob("*") if path.is_file() and path.parent != folder]
+    name, shape, _ = programs._read(place)
+    programs._write(place, lambda: content(name, shape))
+    again, then = Kept(solved), Kept(solved)
+    assert_right(again(TASK, MATRIX))
+    assert_right(then(TASK, MATRIX))
+    assert (again.traces, then.traces) == (1, 0)
+
+
+def test_a_program_that_is_something_else_is_made_again(x64, folder):
+    assert_right(Kept(solved)(TASK, MATRIX))
+    (program,) = [path for path in folder.iterdir() if path.is_file()]
+    programs._write(program, lambda: 5)
+    assert_right(Kept(solved)(TASK, MATRIX))
+    again = Kept(solved)
+    assert_right(again(TASK, MATRIX))
+    assert again.traces == 0
+
+
+def test_what_is_read_is_no_other_programs(x64, folder):
+    """A file that was copied to the name of another is noticed."""
+    program = Kept(solved)
+    for scale in (1.0, 2.5):
+        assert_right(program(TASK, MATRIX, scale), scale)
+    one, other = [path for path in folder.rglob("*") if path.is_file() and path.parent != folder]
+    one.write_bytes(other.read_bytes())
+    program = Kept(solved)
+    for scale in (1.0, 2.5):
+        assert_right(program(TASK, MATRIX, scale), scale)
+    assert program.traces == 1
+
+
 def test_changed_code_is_traced_again_and_compiled_only_if_it_says_something_else(
     x64, folder, monkeypatch
 ):
@@ -119,7 +168,7 @@ def test_programs_that_differ_in_unused_arguments_are_not_confused(x64, folder):
         one, other = Kept(first), Kept(second)
 
 
-def test_what_nobody_uses_is_removed_when_the_code_changes(x64, folder, monkeypatch):
+def test_what_nobody_uses_is_removed(x64, folder):
     assert_right(Kept(solved)(TASK, MATRIX))
     old = [path for path in folder.rglob("*") if path.is_file()]
     unused, beside = folder / "unused", folder.parent / "somebody-elses"
@@ -128,20 +177,66 @@ def test_what_nobody_uses_is_removed_when_the_code_changes(x64, folder, monkeypa
     for path in (*old, unused, beside):
         os.utime(path, (0, 0))
     assert_right(Kept(solved)(TASK, MATRIX))  # the program is in use, and says so
-    monkeypatch.setattr(programs, "_code", lambda: "f" * 64)
-    assert_right(Kept(solved)(TASK, MATRIX))
-    assert beside.exists() and not unused.exists() and sum(path.exists() for path in old) == 1
+    assert_right(Kept(solved)(TASK, MATRIX, 2.5), 2.5)
+    assert beside.exists() and not unused.exists() and all(path.exists() for path in old)
 
 
-def test_what_holds_an_own_class_is_not_kept(x64, tmp_path, monkeypatch):
-    class Own(Muscle):
-        """Somebody else's muscle, whose code may change without a sign. The tests keep what stands
-        in a file, not this."""
+def test_the_folder_does_not_grow_for_ever(x64, folder, monkeypatch):
+    """What was used longest ago has to go first."""
+    scales = [1.0, 2.0, 3.0, 4.0]
+    for age, scale in enumerate(scales):
+        before = set(folder.rglob("*"))
+        assert_right(Kept(solved)(TASK, MATRIX, scale), scale)
+        for path in set(folder.rglob("*")) - before:
+            os.utime(path, (path.stat().st_mtime - 1000 + age,) * 2)
+    largest = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    monkeypatch.setattr(programs, "LARGEST", largest)
+    assert_right(Kept(solved)(TASK, MATRIX, 1.0))  # from now on the second is the oldest
+    assert_right(Kept(solved)(TASK, MATRIX, 5.0), 5.0)
+    assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) <= largest
+    again = {scale: Kept(solved) for scale in (1.0, 3.0, 4.0, 5.0, 2.0)}
+    for scale, program in again.items():
+        assert_right(program(TASK, MATRIX, scale), scale)
+    assert [program.traces for program in again.values()] == [0, 0, 0, 0, 1]
 
+
+class Stiff(Muscle):
+    """Somebody's muscle."""
+
+    times = 1.0
+
+    def base(self):
+        return self.times * Muscle.base(self)
+
+
+def test_the_program_of_an_own_class_is_traced_in_every_process(x64, tmp_path, monkeypatch):
+    """Its code may change without a sign; so what it makes is compared, and then loaded."""
     monkeypatch.setattr(programs, "program_folder", lambda: tmp_path)
-    task = TASK.with_parts(muscle=Own())
-    assert_right(Kept(solved)(task, MATRIX))
-    assert not list(tmp_path.rglob("*"))
+    monkeypatch.setattr(programs.jax, "devices", lambda *_: [jax.local_devices()[0]])
+    monkeypatch.setattr(programs, "_place", lambda *_: None)  # the tests know their own classes
+    compiled, compile_ = [], programs._machine_code
+    monkeypatch.setattr(
+        programs, "_machine_code", lambda *given: compiled.append(1) or compile_(*given)
+    )
+    task = TASK.with_parts(muscle=Stiff())
+    for times, expected in ((1.0, 1), (1.0, 1), (2.0, 2), (1.0, 2)):
+        monkeypatch.setattr(Stiff, "times", times)
+        program = Kept(solved)
+        np.testing.assert_allclose(
+            program(task, MATRIX)["base"], times * np.asarray(TASK.muscle.base()), rtol=1e-12
+        )
+        assert program.traces == 1 and len(compiled) == expected
+
+
+def test_what_calls_python_is_not_kept(x64, folder):
+    """No other process has that function."""
+
+    def calls(x):
+        return jax.pure_callback(lambda x: 2.0 * x, x, x)
+
+    for _ in range(2):
+        assert Kept(calls)(jnp.ones(2)).tolist() == [2.0, 2.0]
+    assert not list(folder.rglob("*"))
 
 
 def test_a_folder_that_cannot_be_written_is_done_without(x64, folder, monkeypatch):
@@ -236,7 +331,7 @@ def test_between_processes(tmp_path):
         ended(one)[0].partition("-")
         for one in [python(SOLVED, **given) for given in (off, users, users)]
     ]
-    assert alone[0] == "1" and not (tmp_path / "none" / "jaxmuscle").exists()
+    assert alone[0] == "1" and not list((tmp_path / "none").glob("jaxmuscle*"))
     last = ended(python(SOLVED, **users))[0].partition("-")
     assert last[0] == "0" and all(found[2] == last[2] for found in (alone, *both))
 
@@ -257,3 +352,14 @@ def test_another_process_loads_what_this_one_made(x64):
     """It traces nothing, and imports nothing that only tracing and drawing need."""
     power = np.asarray(jm.expected_spectrum(jm.Isometric()).power)
     assert ended(true_python(LOADED))[0].split() == ["0", power.tobytes().hex(), "0"]
+
+
+def test_a_folder_that_others_can_open_is_done_without(tmp_path):
+    """Nothing is read from it and nothing written; one notice says so."""
+    folder = tmp_path / "jax" / "jaxmuscle-programs"
+    folder.mkdir(parents=True)
+    folder.chmod(0o777)
+    twice = SOLVED + "Kept(lambda x: 2.0 * x)(np.ones(2))\n"
+    said, errors = ended(python(twice, JAX_COMPILATION_CACHE_DIR=str(tmp_path / "jax")))
+    assert said.startswith("1-") and not list(folder.rglob("*"))
+    assert errors.count("notice:") == 1 and str(folder) in errors

@@ -28,7 +28,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle import paper
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle._common.environment import UNDIVIDED_LOOPS, keep_compiled_programs
+from jaxmuscle._common.environment import UNDIVIDED_LOOPS
 from jaxmuscle.commands.console import write_fit
 from jaxmuscle.commands.main import app
 from jaxmuscle.paper._claims import claims_json
@@ -41,13 +41,8 @@ POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
 
 
 @pytest.fixture(autouse=True)
-def keep_cache(monkeypatch):
-    """Commands switch the compilation cache; the tests keep theirs. Messages are not to be broken
-    into lines."""
+def unbroken_lines(monkeypatch):
     monkeypatch.setenv("COLUMNS", "1000")
-    before = jax.config.jax_compilation_cache_dir
-    yield
-    jax.config.update("jax_compilation_cache_dir", before)
 
 
 def run(*arguments):
@@ -1196,33 +1191,6 @@ main()
     result = jm.load_result(tmp_path / "out" / "fit.json")
     assert not result.success and "interrupted after" in result.message
     assert np.all(np.isfinite(read_columns(tmp_path / "out" / "spectrum.csv")["fitted"]))
-
-
-# --- compilation cache
-
-
-def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file" / "cache"))
-    assert keep_compiled_programs() is None
-    assert jax.config.jax_compilation_cache_dir is None
-    monkeypatch.setattr(jm, "fit", lambda *_, **__: made_result())
-    assert run("fit", csv_file(tmp_path), "--out", tmp_path / "out").exit_code == 0
-
-
-def test_the_cache_is_where_the_environment_says(tmp_path, monkeypatch):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "new" / "cache"))
-    assert keep_compiled_programs() == tmp_path / "new" / "cache"
-    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "new" / "cache")
-    assert (tmp_path / "new" / "cache").is_dir()
-
-
-def test_the_cache_is_the_users_without_environment(tmp_path, monkeypatch):
-    import platformdirs
-
-    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
-    monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path / name)
-    assert keep_compiled_programs() == tmp_path / "jaxmuscle" / "jax"
 
 
 def test_the_console_script_is_the_command():

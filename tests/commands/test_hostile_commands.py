@@ -25,10 +25,9 @@ def keep_settings(monkeypatch):
     broken into lines."""
     monkeypatch.setenv("COLUMNS", "1000")
     jax.devices()  # from now on there can be no more of them
-    before = jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64
+    before = jax.config.jax_enable_x64
     yield
-    jax.config.update("jax_compilation_cache_dir", before[0])
-    jax.config.update("jax_enable_x64", before[1])
+    jax.config.update("jax_enable_x64", before)
 
 
 def run(*arguments):

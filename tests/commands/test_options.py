@@ -81,10 +81,9 @@ def here(tmp_path, monkeypatch):
         )
     (tmp_path / "s.csv").write_text("file,person\nr.csv,a\nr2.csv,b\n")
     (tmp_path / "folder").mkdir()
-    before = jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64
+    before = jax.config.jax_enable_x64
     yield tmp_path
-    jax.config.update("jax_compilation_cache_dir", before[0])
-    jax.config.update("jax_enable_x64", before[1])
+    jax.config.update("jax_enable_x64", before)
 
 
 def kind_of(parameter: inspect.Parameter) -> Any:

@@ -600,15 +600,8 @@ def command(*arguments):
     return result
 
 
-@pytest.fixture
-def keep_cache():
-    before = jax.config.jax_compilation_cache_dir
-    yield
-    jax.config.update("jax_compilation_cache_dir", before)
-
-
 @pytest.mark.parametrize("success", [True, False])
-def test_the_command_writes_its_files(success, tmp_path, monkeypatch, keep_cache):
+def test_the_command_writes_its_files(success, tmp_path, monkeypatch):
     asked = {}
 
     def compare_noise(task, target, **options):
@@ -659,7 +652,7 @@ def test_the_command_writes_its_files(success, tmp_path, monkeypatch, keep_cache
         ([FORCE, "--free", "k_x"], "free: unknown parameter 'k_x'"),
     ],
 )
-def test_a_users_mistake_is_one_line(arguments, message, tmp_path, keep_cache):
+def test_a_users_mistake_is_one_line(arguments, message, tmp_path):
     result = command(*arguments, "--out", tmp_path / "out")
     assert result.exit_code == 2 and message in result.stderr and "Traceback" not in result.output
 

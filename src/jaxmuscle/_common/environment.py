@@ -3,7 +3,10 @@ threads of a fit."""
 
 import contextlib
 import functools
+import logging
 import os
+import stat
+import sys
 import threading
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -16,57 +19,79 @@ import platformdirs
 # machine code. Else XLA splits what is inside it among all cores, although these are busy with
 # other seeds.
 UNDIVIDED_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
-
-
-def keep_compiled_programs() -> Path | None:
-    """Switch JAX's persistent compilation cache on; returns its folder.
-
-    `$JAX_COMPILATION_CACHE_DIR`, else the user's cache folder; a folder that cannot be written is
-    done without (None), and so is any with `$JAXMUSCLE_CACHE=off`.
-    """
-    import jax
-
-    if _off():
-        return _without(jax)
-    folder = Path(
-        os.environ.get("JAX_COMPILATION_CACHE_DIR")
-        or platformdirs.user_cache_path("jaxmuscle") / "jax"
-    )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return _without(jax)
-    if not os.access(folder, os.W_OK | os.X_OK):
-        return _without(jax)
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-    return folder
-
-
-def _without(jax) -> None:
-    jax.config.update("jax_compilation_cache_dir", None)
-
-
-def _off() -> bool:
-    return os.environ.get("JAXMUSCLE_CACHE", "").lower() == "off"
+LOG = logging.getLogger("jaxmuscle")
 
 
 def program_folder() -> Path | None:
-    """Where compiled programs are kept, None for nowhere; switches JAX's own cache on as well,
-    unless it was set.
+    """Where compiled programs are kept, None for nowhere: beside those of JAX's own cache where one
+    was set, else in the user's cache folder.
 
-    `$JAXMUSCLE_CACHE=off` switches both off; the folder is that of JAX's cache where one was set,
-    else the user's.
+    `$JAXMUSCLE_CACHE=off` switches keeping off. Programs are code: a folder in which somebody else
+    could have put one is done without, with a notice, and so is one that cannot be made.
     """
     import jax
 
-    if _off():
+    if os.environ.get("JAXMUSCLE_CACHE", "").lower() == "off":
         return None
-    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if folder and "://" in folder:  # of a remote store, which JAX can write to
+    known = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if known and "://" in known:  # of a remote store, which JAX can write to
         return None
-    known = Path(folder) if folder else keep_compiled_programs()
-    return None if known is None else known / "jaxmuscle"
+    folder = (
+        Path(known) / "jaxmuscle-programs"
+        if known
+        else platformdirs.user_cache_path("jaxmuscle") / "programs"
+    )
+    try:
+        folder = folder.parent.resolve() / folder.name
+        for place in (*reversed(folder.parents), folder):
+            place.mkdir(mode=0o700, exist_ok=True)  # also those above it, whatever the umask
+        fault = None if sys.platform == "win32" else _fault(folder)
+    except (OSError, RuntimeError) as error:  # RuntimeError: links in a circle
+        fault = str(error)
+    if fault is None:
+        return folder
+    _notice(f"{folder} is not used, compiled programs are not kept: {fault}")
+    return None
+
+
+def _fault(folder: Path) -> str | None:
+    """Why somebody else could put files into a folder, or another folder in its place.
+
+    None of the folders above it may be a link: each is looked at as it is.
+    """
+    for place in (folder, *folder.parents):
+        state = place.lstat()
+        if state.st_uid not in (0, os.geteuid()):
+            return f"{place} belongs to another user"
+        if place == folder and (not stat.S_ISDIR(state.st_mode) or state.st_mode & 0o077):
+            return "it is no folder that only you can open; remove it"
+        # in a sticky folder, such as /tmp, nobody can replace what is another's
+        if not state.st_mode & stat.S_ISVTX and _is_writable_by_others(state):
+            return f"others can write to {place}; `chmod go-w` it"
+    return None
+
+
+def _is_writable_by_others(state: os.stat_result) -> bool:
+    """By all, or by a group; not by the group of the user's name that many systems make for each
+    user."""
+    import grp
+    import pwd
+
+    if not state.st_mode & 0o022:
+        return False
+    try:
+        name = pwd.getpwuid(os.geteuid()).pw_name
+        group = grp.getgrgid(state.st_gid)
+    except KeyError:
+        return True
+    alone = group.gr_name == name and set(group.gr_mem) <= {name}
+    return bool(state.st_mode & 0o002) or not alone
+
+
+@functools.cache
+def _notice(text: str) -> None:
+    """Say it once."""
+    LOG.warning("notice: %s", text)
 
 
 def usable_cores() -> int:

@@ -9,10 +9,11 @@ import os
 import pickle
 import platform
 import re
+import secrets
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar
@@ -43,6 +44,7 @@ OTHERS = (
 )
 KNOWN = ("jaxmuscle", "builtins", "collections", *OTHERS)
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")
+UNKNOWN = re.compile(r"_[0-9a-f]{16}_kept\b")
 CONFIG = (
     "jax_enable_x64",
     "jax_numpy_dtype_promotion",
@@ -55,9 +57,11 @@ CONFIG = (
 # XLA's older way to make code of loops: compiled in half the time, loaded in three quarters, and
 # run as fast.
 OPTIONS = {"xla_cpu_use_fusion_emitters": False}
-HIT = "/jax/compilation_cache/cache_hits"
 UNUSED = 60 * 86400.0  # seconds
-LOCK = threading.Lock()
+LARGEST = 2**30  # bytes of the folder
+# jaxlib 0.10 cuts a batch of LAPACK's calls into pieces for its own threads and blocks one of them
+# until they are done: as many programs at once as there are threads would wait for ever.
+LAPACK = threading.Lock()
 LOG = logging.getLogger("jaxmuscle")
 
 
@@ -68,13 +72,19 @@ class _Slot(NamedTuple):
 
 
 class _Program(NamedTuple):
-    """A compiled program of arrays, and the tree of what it returns, a `_Slot` for each array."""
+    """A compiled program of arrays, the tree of what it returns, a `_Slot` for each array, and
+    whether it calls LAPACK."""
 
     call: Callable[..., Any]
     shape: Any
+    calls_lapack: bool
 
     def __call__(self, arrays: list[Any]) -> Any:
-        found = self.call(*arrays)
+        if self.calls_lapack and _version("jaxlib").startswith("0.10."):
+            with LAPACK:
+                found = jax.block_until_ready(self.call(*arrays))
+        else:
+            found = self.call(*arrays)
         return jax.tree.map(
             lambda x: found[x.number] if isinstance(x, _Slot) else x, self.shape, is_leaf=_is_slot
         )
@@ -93,8 +103,9 @@ class Kept:
     kept between processes.
 
     As `eqx.filter_jit`; a program is loaded if its code, its versions, the machine and the
-    structure of its arguments are the same. Anything that stands against it (an own class among the
-    arguments, no folder, a damaged file) means that it is traced and compiled as usual.
+    structure of its arguments are the same. One with an own class among its arguments is traced in
+    every process, and loaded if that gives the same program. Anything that stands against it (no
+    folder, several devices, a damaged file) means that it is traced and compiled as usual.
     `JAXMUSCLE_CACHE=off` switches keeping off.
     """
 
@@ -145,16 +156,10 @@ class Kept:
         signature: Any,
     ) -> _Program:
         """From the folder, or traced, compiled and put there."""
-        folder = program_folder()
-        place = (
-            None
-            if folder is None or len(jax.devices()) > 1
-            else _place(folder, self.function, signature)
-        )
-        if place is not None and (entry := _read(place)) is not None:
-            compiled = _load(place.parent.parent / entry[0])
-            if compiled is not None:
-                return _Program(compiled, entry[1])
+        folder = program_folder() if len(jax.devices()) == 1 else None
+        place = None if folder is None else _place(folder, self.function, signature)
+        if place is not None and (found := _kept_program(place)) is not None:
+            return found
         shape: list[Any] = []
 
         def flat(*arrays: Any) -> tuple[Any, ...]:
@@ -172,15 +177,11 @@ class Kept:
             ]
             return tuple(x for x in leaves if _is_array(x))
 
-        # A name that JAX's own cache does not know, see `_compiled`.
-        flat.__name__ = ("" if place is None else "kept_") + getattr(
-            self.function, "__name__", "program"
-        )
+        name = getattr(self.function, "__name__", "program")
+        flat.__name__ = name if folder is None else _unknown(name)
         # Unused arguments stay: programs that say the same take the same arguments.
         lowered = jax.jit(flat, keep_unused=True).lower(*arrays)
-        if place is None:
-            return _Program(_machine_code(lowered, self.options), shape[0])
-        return _Program(_compiled(lowered, self.options, place, shape[0]), shape[0])
+        return _compiled(lowered, self.options, folder, place, shape[0])
 
 
 def _machine_code(lowered: Any, options: Mapping[str, Any]) -> Any:
@@ -194,49 +195,34 @@ def _machine_code(lowered: Any, options: Mapping[str, Any]) -> Any:
         return lowered.compile()
 
 
-def _compiled(lowered: Any, options: Mapping[str, Any], place: Path, shape: Any) -> Any:
-    """A lowered program, compiled or from the folder if code that was changed gives the same one;
-    put there."""
-    key = (lowered.as_text(), _versions(), _machine(), os.environ.get("XLA_FLAGS", ""), options)
+def _compiled(
+    lowered: Any, options: Mapping[str, Any], folder: Path | None, place: Path | None, shape: Any
+) -> _Program:
+    """A lowered program, compiled or from the folder if other code gave the same one; put there,
+    and its name into its place, if it has one."""
+    text = UNKNOWN.sub("", lowered.as_text())
+    calls_lapack = "lapack_" in text
+    if folder is None or "callback" in text:  # of Python, which no other process has
+        return _Program(_machine_code(lowered, options), shape, calls_lapack)
+    key = (text, _versions(), _machine(), os.environ.get("XLA_FLAGS", ""), options)
     name = hashlib.sha256(repr(key).encode()).hexdigest()
-    folder = place.parent.parent
-    if not place.parent.exists():
-        _tidied(folder)
     program = folder / name
     compiled = _load(program)
-    if compiled is None:
-        before = len(_hits())
-        with _beside_jax():
-            compiled = _machine_code(lowered, options)
-        # What JAX's own cache gave back cannot be written again: XLA would leave its functions out.
-        if len(_hits()) == before:
-            _write(program, lambda: _serialized(compiled))
-    if program.exists():
-        _write(place, lambda: (name, shape))
-    return compiled
+    is_new = compiled is None
+    if is_new:
+        compiled = _machine_code(lowered, options)
+        _write(program, lambda: _serialized(compiled))
+    if place is not None and program.exists():
+        _write(place, lambda: (name, shape, calls_lapack))
+    if is_new:
+        _tidied(folder)
+    return _Program(compiled, shape, calls_lapack)
 
 
-@contextlib.contextmanager
-def _beside_jax() -> Iterator[None]:
-    """JAX's own cache writes nothing: one copy of a program is enough. One thread at a time, since
-    it sets an option."""
-    with LOCK:
-        least = jax.config.jax_persistent_cache_min_compile_time_secs  # pyright: ignore[reportAttributeAccessIssue]
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1e9)
-        try:
-            yield
-        finally:
-            jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
-
-
-@functools.cache
-def _hits() -> list[str]:
-    """What JAX's cache of compiled programs has given back, one entry each."""
-    found: list[str] = []
-    jax.monitoring.register_event_listener(
-        lambda event, **_: found.append(event) if event == HIT else None
-    )
-    return found
+def _unknown(name: str) -> str:
+    """The name of a program that JAX's own cache, where one is set, cannot know: what it gives back
+    cannot be written, since XLA would leave its functions out."""
+    return f"{name}_{secrets.token_hex(8)}_kept"
 
 
 def kept(function: Callable[P, R]) -> Callable[P, R]:
@@ -326,11 +312,11 @@ def _code() -> str:
     return digest.hexdigest()
 
 
-@functools.cache
 def _versions() -> tuple[str, ...]:
     return tuple(map(_version, OTHERS))
 
 
+@functools.cache
 def _version(name: str) -> str:
     try:
         return version(name)
@@ -363,20 +349,31 @@ def _write(place: Path, content: Callable[[], Any]) -> None:
     """Write what can be pickled, a digest before it; what cannot be written is done without."""
     try:
         whole = pickle.dumps(content())
-        place.parent.mkdir(parents=True, exist_ok=True)
+        place.parent.mkdir(mode=0o700, exist_ok=True)  # also where the user has just removed it
         with replacing(place) as temporary:
-            temporary.write_bytes(hashlib.sha256(whole).digest() + whole)
+            temporary.write_bytes(_digest(place, whole) + whole)
     except Exception as error:  # a cache: the program is there, it is only not kept
         LOG.debug("not kept: %s: %s", place.name, error)
 
 
+def _digest(place: Path, whole: bytes) -> bytes:
+    """Of a file's content under its name: a copy with another name is damaged."""
+    return hashlib.sha256(place.name.encode() + whole).digest()
+
+
 def _tidied(folder: Path) -> None:
-    """Remove what nobody has used for two months from the folder of programs, before new code adds
-    its own."""
-    now = time.time()
-    for path in folder.rglob("*") if folder.exists() else ():
+    """Remove what nobody has used for two months, and then what was used longest ago, until the
+    folder is small enough."""
+    found, now, whole = [], time.time(), 0
+    for path in folder.rglob("*"):
         with contextlib.suppress(OSError):
-            if path.is_file() and now - path.stat().st_mtime > UNUSED:
+            if path.is_file():
+                state = path.stat()
+                found.append((state.st_mtime, state.st_size, path))
+    for used, size, path in sorted(found, reverse=True):
+        whole += size
+        if now - used > UNUSED or whole > LARGEST:
+            with contextlib.suppress(OSError):
                 path.unlink()
 
 
@@ -384,7 +381,9 @@ def _read(place: Path) -> Any:
     """What `_write` wrote; None if there is nothing, or something damaged."""
     try:
         whole = place.read_bytes()
-        if hashlib.sha256(whole[32:]).digest() == whole[:32]:
+        with contextlib.suppress(OSError):
+            os.utime(place)  # it is in use, see `_tidied`
+        if _digest(place, whole[32:]) == whole[:32]:
             return pickle.loads(whole[32:])
         LOG.debug("damaged: %s", place.name)
     except OSError:
@@ -404,13 +403,24 @@ def _prepare() -> None:
     jax.jit(jax.lax.linalg.lu).lower(np.eye(1))
 
 
+def _kept_program(place: Path) -> _Program | None:
+    """What was put there as the program of that file; None if there is none, or something else."""
+    match _read(place):
+        case (str(name), shape, bool(calls_lapack)):
+            compiled = _load(place.parent.parent / name)
+            slots = [
+                leaf.number for leaf in jax.tree.leaves(shape, is_leaf=_is_slot) if _is_slot(leaf)
+            ]
+            if compiled is not None and slots == list(range(compiled.out_tree.num_leaves)):
+                return _Program(compiled, shape, calls_lapack)
+    return None
+
+
 def _load(place: Path) -> Any:
     """A compiled program that was kept; None if there is none, or a damaged one."""
     made = _read(place)
     if made is None:
         return None
-    with contextlib.suppress(OSError):
-        os.utime(place)  # it is in use, see `_tidied`
     _prepare()
     try:
         from jax.experimental.serialize_executable import deserialize_and_load

@@ -86,9 +86,6 @@ def compare(
         jaxmuscle compare my-displacement.csv --quantity displacement --segments 12
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
-
-        keep_compiled_programs()
         fixed = fixed_values(fix)
         names = names_in(free)
         read = {"quantity": quantity, "segments": segments}

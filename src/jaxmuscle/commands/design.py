@@ -98,7 +98,6 @@ def design(
         jaxmuscle design fit.json --quantity K_w0,K_z0 --durations 30,60,120 --error 10
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
         from jaxmuscle._common.figures import write_figure
         from jaxmuscle._common.text import folded
 
@@ -115,7 +114,6 @@ def design(
             raise ValueError(
                 f"--error {error:g}: give a percentage between 0 and 100, as --error 10"
             )
-        keep_compiled_programs()
         writable(
             output,
             "motor.csv",

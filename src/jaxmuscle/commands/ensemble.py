@@ -145,8 +145,6 @@ def ensemble(
         jaxmuscle ensemble fit.json --seeds 1000000 --reduce --out out/parts.zarr --part 3/64
     """
     with alone_or_together(coordinator, processes, as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
-
         if states and reduce:
             raise ValueError(
                 "--states keeps trajectories and --reduce throws them away: leave out one of them"
@@ -160,7 +158,6 @@ def ensemble(
         use(precision)
         if part is None and (together or jm.ensembles.launched()):
             jm.ensembles.join(coordinator, processes, process_id)
-        keep_compiled_programs()
         if force:
             spare([preset], [Path(output.removeprefix("file://"))])
         model = task_of(preset, task, observe)

@@ -52,10 +52,8 @@ def explore(
         jaxmuscle explore out/fit/fit.json --out fit.html --no-open
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
         from jaxmuscle._common.files import write_text
 
-        keep_compiled_programs()
         if output is not None:
             spare([what] if what else [], [output])
         model, target = _content(what, task, segments)

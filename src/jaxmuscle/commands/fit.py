@@ -253,9 +253,6 @@ def fit(
         jaxmuscle fit figure.tar --dataset "95 MVC" --segments 6
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
-
-        keep_compiled_programs()
         options: dict[str, Any] = {
             "fix": fixed_values(fix),
             "free": names_in(free),

@@ -52,10 +52,8 @@ def identifiability(
         jaxmuscle identifiability my-spectrum.csv --segments 12 --out out/next
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
         from jaxmuscle._common.figures import write_figure
 
-        keep_compiled_programs()
         writable(
             output,
             *fit_unless_taken_up(output, target),

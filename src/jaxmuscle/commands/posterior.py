@@ -95,11 +95,9 @@ def posterior(
     """
     with reporting(as_json):
         from jaxmuscle._common.arguments import require_extra
-        from jaxmuscle._common.environment import keep_compiled_programs
         from jaxmuscle.reports import REPORT
 
         require_extra("posterior")
-        keep_compiled_programs()
         several = [output / "posterior.json", *[Path(target)] * target.endswith(".json")]
         drawn = [f"predictive-{name}" for path in several for name in parts_of(path)]
         writable(

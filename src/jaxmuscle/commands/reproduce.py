@@ -40,9 +40,6 @@ def reproduce(
         jaxmuscle reproduce --recording anna.csv --recording ben.csv --recording chris.csv
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
-
-        keep_compiled_programs()
         writable(
             output,
             "claims.json",

@@ -48,9 +48,6 @@ def simulate(
         jaxmuscle simulate out/fit/fit.json --task prescribed-force --observe acceleration
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
-
-        keep_compiled_programs()
         model = task_of(preset, task, observe)
         writable(
             output,

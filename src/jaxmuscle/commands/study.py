@@ -107,9 +107,6 @@ def study(
         jaxmuscle study study.toml --correction fdr --quantities mean,tremor_frequency
     """
     with reporting(as_json):
-        from jaxmuscle._common.environment import keep_compiled_programs
-
-        keep_compiled_programs()
         span = edges_of(window)
         _writable(output, table, force=force)
         found = jm.run_study(

