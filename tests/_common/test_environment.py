@@ -212,7 +212,7 @@ else:
     found = jm.fit(task, jm.load_target("vastus-lateralis-26mvc"), free=("c_w", "noise_K_w"),
                    starts=2, seeds=8, check_seeds=0, rungs=0, max_steps=4)
     jm.identifiability(found)
-    jm.posterior(found, chains=1, draws=4, warmup=4)
+    jm.posterior(found, chains=2, draws=100, warmup=20)
 changed = {name for name, value in jax.config.values.items() if value != before[name]}
 
 files = all_files()
@@ -235,5 +235,5 @@ print(len(files) > 4, changed, [path for path in all_files() if path not in file
 def test_settings_of_jax_stay_as_they_are(kind):
     """What a user compiles is not kept in the folder of the programs."""
     users = {"XDG_CACHE_HOME": str(OUT / "user"), "JAX_COMPILATION_CACHE_DIR": ""}
-    told = ended(true_python(SETTINGS, kind, **users))[0]
+    told = ended(true_python(SETTINGS, kind, **users), seconds=600)[0]
     assert told.split("\n")[-2] == "True set() []"

@@ -229,7 +229,7 @@ def test_the_program_of_an_own_class_is_traced_in_every_process(x64, tmp_path, m
 
 
 def test_what_calls_python_is_not_kept(x64, folder):
-    """No other process has that function."""
+    """No other process has that function: JAX's own serialisation refuses it."""
 
     def calls(x):
         return jax.pure_callback(lambda x: 2.0 * x, x, x)

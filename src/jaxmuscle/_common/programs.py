@@ -202,7 +202,7 @@ def _compiled(
     and its name into its place, if it has one."""
     text = UNKNOWN.sub("", lowered.as_text())
     calls_lapack = "lapack_" in text
-    if folder is None or "callback" in text:  # of Python, which no other process has
+    if folder is None:
         return _Program(_machine_code(lowered, options), shape, calls_lapack)
     key = (text, _versions(), _machine(), os.environ.get("XLA_FLAGS", ""), options)
     name = hashlib.sha256(repr(key).encode()).hexdigest()
