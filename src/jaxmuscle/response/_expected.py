@@ -197,14 +197,14 @@ def response(
     system = linearise(task)
     noise, variance = noise_response(task, system, settings, samples, recorded)
     line, swing = harmonic_line(task, system, settings, window, samples)
-    unknown = jnp.full((), jnp.nan, line.dtype)  # the slowest rate has no second derivative
     resonant = tuple(
         own
         for own, part in zip(noise, task.noise.components, strict=True)
         if isinstance(part, ResonantNoise)
     )
     power = jnp.sum(noise, axis=0) + line
-    return Moments(power, line, system.rest, variance + swing, unknown, unknown, resonant), system
+    # Without the slowest rate, which has no second derivative.
+    return Moments(power, line, system.rest, variance + swing, resonant=resonant), system
 
 
 _compiled_response = kept(response)
