@@ -441,6 +441,36 @@ def test_a_rate_without_known_aliases_is_refused(rate, sampling):
         jm.expected_spectrum(jm.Isometric(), Settings(sampling=sampling), recorded_at=rate)
 
 
+def derivative(task, target):
+    def power(k):
+        return jm.expected_spectrum(task.replace(k_w=k)).proportional[10]
+
+    return jax.grad(power)(jnp.asarray(task["k_w"])), jax.jit(power)(jnp.asarray(task["k_w"]))
+
+
+PUBLIC = {
+    "expected_spectrum": lambda task, target: jm.expected_spectrum(task).power,
+    "expected_variation": lambda task, target: jm.response.expected_variation(task),
+    "its derivative": derivative,
+    "log_likelihood": jm.log_likelihood,
+    "sensitivity": lambda task, target: jm.sensitivity(task, ["k_w"]).power,
+    "simulate": lambda task, target: jm.simulate(task, KEY, duration=1.0).output,
+    "fit": lambda task, target: jm.fit(task, target, rungs=0, starts=4, max_steps=3).task["k_w"],
+}
+
+
+@pytest.mark.parametrize(
+    "call", [pytest.param(n, marks=pytest.mark.slow) if n == "fit" else n for n in PUBLIC]
+)
+def test_public_functions_run_where_jax_looks_for_nan(call):
+    target = jm.load_target("vastus-lateralis-26mvc")
+    with jax.debug_nans(True):
+        found = PUBLIC[call](jm.task_for(target), target)
+        assert np.all(np.isfinite(np.concatenate([np.ravel(x) for x in jax.tree.leaves(found)])))
+        with pytest.raises(jm.errors.OperatingPointError, match="undamped"):
+            jm.expected_spectrum(jm.Isometric(c_w=0.0, c_z=0.0))
+
+
 def test_fits_and_likelihoods_expect_the_aliases_of_the_recording(x64):
     """Of the rate at which it was taken, to whatever rates it was resampled since."""
     noise = jm.BandLimitedNoise((0.0016, 0.0016, 0, 0))
