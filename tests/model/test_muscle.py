@@ -252,6 +252,78 @@ def test_a_whole_own_muscle_runs_in_every_task():
     assert run.finite and run.output[-1] != 0
 
 
+def clipped(q):
+    return jnp.where(q < 0, 3 * jnp.clip(q, None, 0.0), 3 * jnp.clip(q, 0.0, None))
+
+
+def chosen(q):
+    return jnp.where(q < 0, 3 * jnp.where(q < 0, q, 0.0), 3 * jnp.where(q < 0, 0.0, q))
+
+
+def sharp(q):
+    return jnp.where(q < 0, 6 * q, 3 * q)
+
+
+def bent(curve, place):
+    """A muscle of one curve, through 0 with the slope 3, in one of its arguments."""
+
+    class Bent(jm.AbstractMuscle):
+        m_w: float = 0.5
+        m_z: float = 0.4
+
+        def base(self):
+            return jnp.array([200.0, 200.0, 20.0, 10.0])
+
+        def drive(self, force, u):
+            return force * (1 + (curve(u[4]) if place == "drive" else u[4]))
+
+        def active_force(self, x_w, v_w, u):
+            damped = curve(v_w) if place == "active" else 20 * v_w
+            return (200 + (curve(u[0]) if place == "u" else u[0])) * x_w + damped
+
+        def passive_force(self, x_w, v_w, x_z, v_z, u):
+            held = curve(x_z) if place == "x_z" else 200 * x_z
+            damped = curve(v_z) - curve(v_w) if place == "passive" else 10 * (v_z - v_w)
+            return held - 200 * x_w + damped
+
+    return Bent()
+
+
+PLACES = {
+    "active": "active_force: at rest its slope with v_w",
+    "passive": "passive_force: at rest its slope with v_w",
+    "u": r"active_force: at rest its slope with u\[0\]",
+    "drive": r"drive: at rest its slope with u\[4\]",
+    "x_z": "passive_force: at rest its slope with x_z",
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_derivative_that_is_no_slope_at_rest_is_refused(place):
+    """`jnp.clip` halves it; a curve that is chosen with `jnp.where` has it."""
+    with pytest.raises(ValueError, match=f"{PLACES[place]}.*JAX's derivative.*jnp.where"):
+        jm.Isometric(muscle=bent(clipped, place))
+    jm.Isometric(muscle=bent(chosen, place))
+
+
+def test_the_side_of_a_sharp_bend_that_counts_is_told():
+    told = r"6 to the left and 3 to the right\. .* to the right;"
+    with pytest.warns(jm.errors.FirstOrderWarning, match=told):
+        task = jm.Isometric(muscle=bent(sharp, "active"))
+    assert float(jax.jacfwd(task.muscle.active_force, 1)(1e-3, 0.0, np.zeros(5))) == 3.0
+
+
+def test_a_law_without_a_slope_at_rest_is_refused():
+    class Creeping(jm.model.AbstractLaw):
+        c: Scalar = 10.0
+
+        def __call__(self, q):
+            return self.c * (1 + jnp.sqrt(jnp.abs(q)))
+
+    with pytest.raises(ValueError, match=r"active_force: at rest its slope .* is nan"):
+        jm.Isometric(muscle=jm.Muscle(damping_w=Creeping()))
+
+
 @pytest.mark.parametrize("field", ["m_w", "m_z"])
 @pytest.mark.parametrize("value", [0.0, -0.1])
 def test_a_mass_must_be_positive(field, value):

@@ -119,7 +119,9 @@ class Kept:
         _ALL.add(self)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        with jax.numpy_rank_promotion("allow"):  # of our own arrays, whatever the caller has set
+        # Of our own arrays, whatever the caller has set; NaN is a sign here (no equilibrium, an
+        # unstable start of a fit), which our own code looks for.
+        with jax.numpy_rank_promotion("allow"), jax.debug_nans(False):
             return self._called(*args, **kwargs)
 
     def _called(self, *args: Any, **kwargs: Any) -> Any:

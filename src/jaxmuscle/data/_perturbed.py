@@ -703,6 +703,7 @@ def _ordinates(
         start=recording.force.start,
         window=edges,
         notices=(*recording.notices, *recording.late(), *cut, *linear, *said),
+        recorded_at=recording.force.recorded_at,
     )
     f = np.fft.rfftfreq(inside.stop - inside.start, 1 / rate)
     return _Ordinates(

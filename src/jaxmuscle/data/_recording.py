@@ -49,6 +49,8 @@ class Recording(Shown, eqx.Module):
     - `start`: time of the first sample [s]; other than 0 if the file begins with a gap.
     - `window`: (start, stop) [s] of the part that is analysed, or all of it.
     - `notices`: what was done to the samples, in sentences.
+    - `recorded_at` [Hz]: the rate before the samples were resampled, by default `rate`. What lay
+      above half of it has folded to lower frequencies; a target states it, and its fit expects it.
 
     `whole` holds all samples, since filters run before the window is cut; `samples` and `time` are
     the window's.
@@ -65,8 +67,9 @@ class Recording(Shown, eqx.Module):
     start: float = eqx.field(static=True)
     window: tuple[float, float] | None = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
+    recorded_at: float = eqx.field(static=True)
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (all that is known of a recording)
         self,
         samples: Any,
         rate: float | int,
@@ -77,8 +80,10 @@ class Recording(Shown, eqx.Module):
         start: float | int = 0.0,
         window: Sequence[float | int] | None = None,
         notices: Iterable[str] = (),
+        recorded_at: float | int | None = None,
     ):
         self.rate, self.start, self.name, self.source = _rate(rate), float(start), name, source
+        self.recorded_at = self.rate if recorded_at is None else _rate(recorded_at)
         spelled = known_unit(unit)
         require(spelled is not None, "unit", unit, choices(unit, UNITS))
         self.unit = str(spelled)
@@ -180,7 +185,9 @@ class Recording(Shown, eqx.Module):
         return max(round((a - self.start) * rate), 0), round((b - self.start) * rate)
 
     def _with(self, samples: Any, rate: float, window: Any, notices: Iterable[str]) -> "Recording":
-        fields = {key: getattr(self, key) for key in ("unit", "name", "source", "start")}
+        fields = {
+            key: getattr(self, key) for key in ("unit", "name", "source", "start", "recorded_at")
+        }
         return Recording(samples, rate, **fields, window=window, notices=notices)
 
     @property
@@ -512,12 +519,20 @@ def pooled_target(
         mvc_fraction=None if full is None else mean / full,
         mean=np.abs(means).tolist() if varying else None,
         unit=unit,
+        recorded_at=_rate_of_all(recordings, segments),
         trial_power=rows if len(rows) > 1 else None,
         settings=settings,
         measured=measure_signals(held, unit, tremor_band(quantity))[1],
         signals=held,
         notices=notices_of(recordings, signals, settings.rate, drifts, quantity),
     )
+
+
+def _rate_of_all(recordings: Sequence[Recording], segments: Sequence[int]) -> float:
+    """The rate [Hz] whose aliases, in proportion to its inverse square, are the mean of theirs."""
+    rates = np.array([recording.recorded_at for recording in recordings])
+    first = rates[0]
+    return float(first / np.sqrt(np.average((first / rates) ** 2, weights=segments)))
 
 
 def notices_of(

@@ -62,6 +62,9 @@ class Target(Shown, eqx.Module):
     - `mvc_fraction`: mean level as a fraction of the maximal voluntary contraction.
     - `mean`, `unit`: mean force or torque of each trial, and its unit. A mean in a unit of force
       fixes its scale in a fit.
+    - `recorded_at`: rate [Hz] at which the recording was taken. If `settings` sample it "filtered",
+      the model's spectrum has the aliases of this rate (from twice that of `settings` on), as it
+      has them without a low-pass before the sampling; if it is `None`, it has none.
     - `trial_power`: spectrum of each trial [unit²/Hz], shape `(trials, bins)`; `proportional_power`
       is their mean, weighted with `segments`.
     - `dispersion`: how many times more the trials' average spectrum scatters than their segments
@@ -95,6 +98,7 @@ class Target(Shown, eqx.Module):
     mvc_fraction: float | None = eqx.field(static=True)
     mean: tuple[float, ...] | None = eqx.field(static=True)
     unit: str | None = eqx.field(static=True)
+    recorded_at: float | int | None = eqx.field(static=True)
     trial_power: Float[np.ndarray, "trials bins"] | None
     dispersion: tuple[float, ...] | None = eqx.field(static=True)
     reason: str | None = eqx.field(static=True)
@@ -119,6 +123,7 @@ class Target(Shown, eqx.Module):
         mvc_fraction: float | None = None,
         mean: float | Sequence[float] | None = None,
         unit: str | None = None,
+        recorded_at: float | int | None = None,
         trial_power: Any = None,
         dispersion: float | Sequence[float] | None = None,
         reason: str | None = None,
@@ -145,6 +150,7 @@ class Target(Shown, eqx.Module):
         self.mvc_fraction = check.metadata("mvc_fraction", mvc_fraction)
         self.mean, self.unit = check.metadata("mean", mean), check.metadata("unit", unit)
         self.reason = check.metadata("reason", reason)
+        self.recorded_at = check.metadata("recorded_at", recorded_at)
         self.measures = check.metadata("measured", measured)
         self.settings, self.samples = settings, Samples(tuple(signals))
         self.stiffness = (
@@ -287,7 +293,8 @@ class Target(Shown, eqx.Module):
     def from_table(cls, table: Mapping[str, Any], *, whole: bool = False) -> "Target":
         """The reverse of `to_table`: each frequency counts as the nearest bin. Raises
         `TargetError`."""
-        fields = fields_of(table, "target_table", needed=KEYS if whole else (*REQUIRED, "settings"))
+        needed = KEYS if whole else (*REQUIRED, "settings")
+        fields = fields_of(table, "target_table", needed=[k for k in needed if k != "recorded_at"])
         fields = {key: value for key, value in fields.items() if value is not None}
         settings = settings_of(
             fields.pop("settings"), "target_table.settings", SpectrumSettings.names(whole=whole)

@@ -43,6 +43,7 @@ METADATA = (
     "mvc_fraction",
     "mean",
     "unit",
+    "recorded_at",
     "dispersion",
     "reason",
     "notices",
@@ -267,6 +268,15 @@ class TargetFile(Table, kw_only=True):
     ] = None
     unit: Annotated[
         Any, says("Unit of `mean`", missing="unknown: `mean` fixes no scale of force", kind="text")
+    ] = None
+    recorded_at: Annotated[
+        Any,
+        says(
+            "Rate of the recording [Hz], before it was resampled; its aliases are expected if"
+            " `sampling` in `settings` is filtered",
+            missing="no aliases are expected",
+            kind="number above 0",
+        ),
     ] = None
     dispersion: Annotated[
         Any,

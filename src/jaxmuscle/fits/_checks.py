@@ -29,7 +29,7 @@ from jaxmuscle.objective._starts import (
 )
 from jaxmuscle.response._expected import Moments, expected_moments
 from jaxmuscle.simulation._trajectory import Trajectory
-from jaxmuscle.spectra._bin_law import BinStatistics, trial_samples
+from jaxmuscle.spectra._bin_law import BinStatistics, recorded_interval, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._part import Estimate, FittedPart, Start
@@ -86,7 +86,8 @@ def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Momen
     power, variance = np.asarray(runs.spectrum(settings).power), held.var(axis=1)
     expected = None
     if runs.linear is not None:
-        exact, _ = expected_moments(runs.task, settings, WINDOW, trial_samples(target))
+        sampled = trial_samples(target), recorded_interval(target, settings)
+        exact, _ = expected_moments(runs.task, settings, WINDOW, *sampled)
         expected = jax.tree.map(np.asarray, exact)
         beside = runs.beside()
         power = expected.power + power - np.asarray(beside.spectrum(settings).power)

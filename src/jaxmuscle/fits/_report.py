@@ -23,7 +23,12 @@ from jaxmuscle.response._expected import Moments, check_power, expected_moments
 from jaxmuscle.response._linearised import settled
 from jaxmuscle.response._second_order import negative_coefficients, second_order
 from jaxmuscle.simulation._simulate import simulate
-from jaxmuscle.spectra._bin_law import bin_statistics, standardised, trial_samples
+from jaxmuscle.spectra._bin_law import (
+    bin_statistics,
+    recorded_interval,
+    standardised,
+    trial_samples,
+)
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._adequacy import Endpoint, elsewhere
@@ -355,10 +360,11 @@ def _parts(
 def _components(part: Part, task: AbstractTask) -> dict[str, np.ndarray]:
     """Share of each bin's power that every part of the model has in linear response, of a settled
     task."""
-    settings, samples = part.target.settings, trial_samples(part.target)
+    settings = part.target.settings
+    sampled = trial_samples(part.target), recorded_interval(part.target, settings)
 
     def powers(task: AbstractTask) -> tuple[np.ndarray, list[np.ndarray]]:
-        moments, _ = expected_moments(task, settings, WINDOW, samples)
+        moments, _ = expected_moments(task, settings, WINDOW, *sampled)
         rhythms = [np.asarray(x)[part.chosen] for x in (moments.line, *moments.resonant)]
         return np.asarray(moments.power)[part.chosen], rhythms
 

@@ -1,6 +1,7 @@
 """Parts that a user writes: muscle, material law, noise. What is wrong is said when a task is made
 of them."""
 
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import scipy
 
 from jaxmuscle._common.arrays import is_concrete, require
+from jaxmuscle._common.errors import FirstOrderWarning
 
 from ._muscle import AbstractLaw, AbstractMuscle, Muscle
 from ._noise import AbstractNoise, Recursion, ShapingFilter
@@ -46,6 +48,8 @@ TAKEN = (
     "observe",
 )
 TAKEN_BEFORE = ("noise_", "harmonic_", "resonance_")
+INVERSE = "contraction_velocity"
+SMALL = 1e-6  # m, m/s, N, N/m: a step from rest
 _SEEN: set[type] = set()
 
 
@@ -58,8 +62,13 @@ def check_muscle(muscle: AbstractMuscle) -> None:
     """
     kind = type(muscle)
     if isinstance(muscle, Muscle):
-        for law in (muscle.stiffness_w, muscle.stiffness_z, muscle.damping_w, muscle.damping_z):
+        laws = (muscle.stiffness_w, muscle.stiffness_z, muscle.damping_w, muscle.damping_z)
+        fresh = [type(law) for law in laws if type(law) not in _SEEN and not _ours(law)]
+        for law in laws:
             _check_law(law)
+        if fresh and all(is_concrete(leaf) for leaf in jax.tree.leaves(muscle)):
+            _check_slopes(muscle)
+            _SEEN.update(fresh)
     if kind is Muscle or kind in _SEEN:
         return
     for name in muscle_paths(muscle):
@@ -77,11 +86,12 @@ def check_muscle(muscle: AbstractMuscle) -> None:
         _check_method(muscle, method, arguments, shape, what)
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(muscle)):
         _check_inverse(muscle)
+        _check_slopes(muscle)
         _SEEN.add(kind)
 
 
 def _check_law(law: AbstractLaw) -> None:
-    """A material law must be one number at one number. A class is looked at once."""
+    """A material law must be one number at one number."""
     require(
         isinstance(law, AbstractLaw),
         f"{law!r} stands for a material law: give one made from AbstractLaw, as "
@@ -89,7 +99,6 @@ def _check_law(law: AbstractLaw) -> None:
     )
     if type(law) not in _SEEN and not _ours(law):
         _check_method(law, "__call__", ("q",), (), "one floating-point number [N/m or N s/m]")
-        _SEEN.add(type(law))
 
 
 def _ours(part: object) -> bool:
@@ -145,6 +154,60 @@ def _check_inverse(muscle: AbstractMuscle) -> None:
             f"{type(muscle).__name__}.contraction_velocity is not the inverse of passive_force: at"
             f" {where} and v_w = {v_w} m/s passive_force is {float(force):.4g} N, but for that"
             f" force contraction_velocity gives {found:.4g} m/s"
+        )
+
+
+def _check_slopes(muscle: AbstractMuscle) -> None:
+    """The linear response takes JAX's derivatives at rest: they must be slopes of the methods.
+
+    Where the slopes to the two sides differ, one of them; a warning says which. Differences over h
+    and h / 2, extrapolated.
+    """
+    own = type(muscle).contraction_velocity is not AbstractMuscle.contraction_velocity
+    methods = [m for m, (_, shape, _) in ASKED.items() if not shape and (own or m != INVERSE)]
+    with jax.enable_x64(True):
+        names = ("x_w", "v_w", "x_z", "v_z", "force", *(f"u[{i}]" for i in range(5)))
+        at = np.array([1e-3, 0.0, 0.0, 0.0, 0.0, *np.zeros(5)])
+        steps = SMALL * np.array([1.0, 0.5, -1.0, -0.5])[:, None, None]
+
+        def values(x: Any) -> Any:
+            given = {"u": x[5:]} | dict(zip(names[:5], x, strict=False))
+            found = [getattr(muscle, m)(*(given[n] for n in ASKED[m][0])) for m in methods]
+            return jnp.stack([jnp.asarray(y, float) for y in found])
+
+        at[4] = float(
+            values(jnp.asarray(at))[methods.index("passive_force")]
+        )  # which the inverse must carry
+        looked = jax.jit(
+            lambda x: (
+                values(x),
+                jax.jacfwd(values)(x),
+                jax.vmap(jax.vmap(values))(x + steps * np.eye(len(at))),
+            )
+        )
+        here, slopes, near = map(np.asarray, looked(at))
+    wide, right, far, left = (near - here) / steps
+    sides = np.stack([2 * left - far, 2 * right - wide]).mT
+    near_enough = 1e-3 * np.abs(sides).max(axis=0) + 1e-8 * (1 + np.abs(here))[:, None]
+    fits = (np.abs(sides - slopes) <= near_enough) | ~np.all(np.isfinite(sides), axis=0)
+    for i, k in np.argwhere(~np.all(fits, axis=0)):
+        left, right = sides[:, i, k]
+        said = (
+            f"{type(muscle).__name__}.{methods[i]}: at rest its slope with {names[k]} is"
+            f" {left:.4g} to the left and {right:.4g} to the right"
+        )
+        if not np.any(fits[:, i, k]):
+            raise ValueError(
+                f"{said}, but JAX's derivative, of which the linear response is made, is"
+                f" {slopes[i, k]:.4g}. jnp.clip, jnp.maximum and jnp.abs take the mean of two"
+                " sides: choose a side by jnp.where, also in the argument of each branch, see"
+                " docs/own-muscle.md"
+            )
+        warnings.warn(
+            f"{said}. The linear response, and so fits, take that to the"
+            f" {'left' if fits[0, i, k] else 'right'}; a simulation has both",
+            FirstOrderWarning,
+            stacklevel=2,
         )
 
 

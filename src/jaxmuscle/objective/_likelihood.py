@@ -23,7 +23,13 @@ from jaxmuscle.response._expected import Moments, check_line, expected_moments
 from jaxmuscle.response._input_response import parts_of_stiffness
 from jaxmuscle.response._linearised import check_inputs
 from jaxmuscle.response._second_order import warn_beyond
-from jaxmuscle.spectra._bin_law import LEAST, bin_statistics, target_law, trial_samples
+from jaxmuscle.spectra._bin_law import (
+    LEAST,
+    bin_statistics,
+    recorded_interval,
+    target_law,
+    trial_samples,
+)
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._consequences import Expansion, expand
@@ -315,8 +321,8 @@ def _gaussian(residuals: Float[Array | np.ndarray, " rows"]) -> Scalar:
 
 
 @kept
-def _target_likelihood(task, bins, chosen, variation, samples, stiffness):
-    moments, system = expected_moments(task, task.settings, WINDOW, samples)
+def _target_likelihood(task, bins, chosen, variation, sampled, stiffness):
+    moments, system = expected_moments(task, task.settings, WINDOW, *sampled)
     found = (
         jnp.zeros(())
         if bins is None
@@ -335,8 +341,8 @@ def _target_likelihood(task, bins, chosen, variation, samples, stiffness):
 
 
 @kept
-def _whittle(task, settings, power, window):
-    moments = expected_moments(task, settings, window)[0]
+def _whittle(task, settings, power, window, recorded):
+    moments = expected_moments(task, settings, window, None, recorded)[0]
     noise, line = moments.power - moments.line, moments.line
     argument = 2 * jnp.sqrt(power * line) / noise
     return jnp.sum(
@@ -376,7 +382,10 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
         task = task.with_parts(settings=data.settings)
         bins = jax.tree.map(jnp.asarray, measured_bins(data)) if len(data.bins) else None
         variation = target_variation(data, task)
-        samples = jnp.asarray(trial_samples(data))
+        sampled = (
+            jnp.asarray(trial_samples(data)),
+            jnp.asarray(recorded_interval(data, data.settings)),
+        )
         stiffness = None
         if data.stiffness is not None:
             known = data.stiffness.known
@@ -388,7 +397,10 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
                 )
             )
         chosen = data.bins - data.settings.first_bin
-        return _target_likelihood(as_arrays(task), bins, chosen, variation, samples, stiffness)
+        return _target_likelihood(as_arrays(task), bins, chosen, variation, sampled, stiffness)
     whole = data.fft_spectrum(task.settings.replace(window="boxcar", tapers=1))
     duration = whole.settings.length / whole.settings.rate
-    return _whittle(as_arrays(task), whole.settings, jnp.asarray(whole.power), (0.0, duration))
+    recorded = jnp.asarray(recorded_interval(data, whole.settings))
+    return _whittle(
+        as_arrays(task), whole.settings, jnp.asarray(whole.power), (0.0, duration), recorded
+    )

@@ -54,8 +54,8 @@ class Linear(eqx.Module):
     """The expected spectrum of a task in linear response, times a `correction` (of a nonlinear
     simulation, say).
 
-    Its variance is that of a recording of so many `samples`. `points`: frequencies of a measured
-    dynamic stiffness [Hz].
+    Its variance is that of a recording of so many `samples`, `recorded` at an interval [s].
+    `points`: frequencies of a measured dynamic stiffness [Hz].
     """
 
     chosen: np.ndarray
@@ -63,6 +63,7 @@ class Linear(eqx.Module):
     samples: Int[Array | np.ndarray, ""]
     window: tuple[float, float] = eqx.field(static=True)
     points: Float[Array | np.ndarray, " points"] | None = None
+    recorded: Float[Array | np.ndarray, ""] | float = 0.0
 
     def compared(self, task: AbstractTask) -> Moments:
         """Expected moments of the task's output that are compared with data: without rate and
@@ -80,7 +81,9 @@ class Linear(eqx.Module):
 
     def _compared(self, task: AbstractTask) -> tuple[Moments, Linearisation]:
         # Compiled apart, so that it is traced once.
-        found, system = expected_moments(task, task.settings, self.window, self.samples)
+        found, system = expected_moments(
+            task, task.settings, self.window, self.samples, self.recorded
+        )
         power, line, resonant = jax.tree.map(
             lambda x: x[self.chosen], (found.power, found.line, found.resonant)
         )
@@ -109,6 +112,7 @@ class MonteCarlo(eqx.Module):
     window: tuple[float, float] = eqx.field(static=True)
     control: bool = eqx.field(static=True)
     points: Float[Array | np.ndarray, " points"] | None = None
+    recorded: Float[Array | np.ndarray, ""] | float = 0.0
 
     @classmethod
     def of(  # noqa: PLR0913 (all that its paths and bins depend on)
@@ -124,6 +128,7 @@ class MonteCarlo(eqx.Module):
         draws: Draws = Draws(),  # noqa: B008
         samples: int | None = None,
         points: Any = None,
+        recorded: float = 0.0,
     ) -> "MonteCarlo":
         """On seeds 0 to `seeds - 1` of the key; `chosen` are the positions of the compared bins
         among the settings' bins.
@@ -144,6 +149,7 @@ class MonteCarlo(eqx.Module):
             window,
             control,
             points,
+            jnp.asarray(recorded),
         )
 
     @property
@@ -169,7 +175,7 @@ class MonteCarlo(eqx.Module):
 
         if self.control:
             task = settled(task)
-            exact, system = response(task, settings, self.window, self.samples)
+            exact, system = response(task, settings, self.window, self.samples, self.recorded)
             seen, beside = outputs(None, task, LinearTask.of(task, system))
             power = exact.power[self.chosen] + jnp.mean(
                 self._power(seen, settings) - self._power(beside, settings), 0

@@ -21,7 +21,13 @@ from jaxmuscle.response._expected import Moments, log_variation_sd
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.simulation._simulate import DURATION, MAX_RATE_STEP, steps_per_sample
-from jaxmuscle.spectra._bin_law import bin_statistics, mean_error, samples_of, trial_samples
+from jaxmuscle.spectra._bin_law import (
+    bin_statistics,
+    mean_error,
+    recorded_interval,
+    samples_of,
+    trial_samples,
+)
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._coordinates import Coordinates, task_at
@@ -118,9 +124,12 @@ class Part:
     ) -> PartResiduals:
         """Its residuals in linear response, times a correction of its moments."""
         known: Moments = jax.tree.map(np.asarray, self.ones if correction is None else correction)
-        samples = np.asarray(trial_samples(self.target))
+        samples, recorded = map(
+            np.asarray,
+            (trial_samples(self.target), recorded_interval(self.target, self.target.settings)),
+        )
         return self.residuals(
-            Linear(self.chosen, known, samples, WINDOW, self.points), residual, share
+            Linear(self.chosen, known, samples, WINDOW, self.points, recorded), residual, share
         )
 
     def residuals(
@@ -325,6 +334,7 @@ class FitProblem:
             draws=self.draws,
             samples=trial_samples(part.target),
             points=part.points,
+            recorded=recorded_interval(part.target, settings),
         )
 
     def finer(self, objective: Residuals, points: Float[np.ndarray, "points free"]) -> Residuals:

@@ -10,6 +10,7 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from jaxmuscle._common.matrices import exponential, product
+from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._activation import ACTIVE
 from jaxmuscle.model._noise import AbstractNoise, ShapingFilter
 from jaxmuscle.model._tasks import AbstractTask
@@ -19,6 +20,7 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 from ._linearised import Linearisation
 
 SHORT = 4
+KINK = 10  # values of r from lag 0 on that say what its kink does to a sum
 
 
 def _sylvester(A: Array, F: Array, Q: Array) -> Array:
@@ -196,30 +198,58 @@ class Autocovariance(NamedTuple):
         return (first + 2 * jnp.sum(self.rows * ((n - q) * sums[0] - sums[1]))) / n**2
 
 
-@functools.cache
-def _folded() -> tuple[Float[np.ndarray, "q points"], Float[np.ndarray, "blocks short"]]:
-    """The autocorrelation ρ of the low-pass: folded, for lags 0 ... q - 1, and as it is, in blocks
-    of 2^SHORT.
+class _Folded(NamedTuple):
+    """The autocorrelation ρ of the low-pass as a quadrature rule, see `_folded`."""
 
-    `r'(lΔ) = Σ_j ρ_j r(|l - j / FINER| Δ)`: from the lag q on, which ρ reaches, no lag is negative.
+    head: Float[np.ndarray, "q points"]
+    coarser: Float[np.ndarray, "2 q kink"]
+    blocks: Float[np.ndarray, "blocks short"]
+
+
+@functools.cache
+def _folded() -> _Folded:
+    """ρ folded for lags 0 ... q - 1, and as it is, in blocks of 2^SHORT: `r'(lΔ) = ∫ ρ(s) r(|lΔ -
+    s|) ds`, a sum in steps of δ = Δ / FINER.
+
+    From the lag q on, which ρ reaches, no lag is negative. Before it r has a kink, where a sum in
+    steps of τδ exceeds the integral, for r(s) = exp(-x s / δ) by
+
+        ρ(lΔ) D(τ) - δ² ρ''(lΔ) τ⁴ x / 120
+        D(τ) = τ coth(τ x / 2) - 2 / x = τ² x / 6 - τ⁴ x³ / 360 ...
+
+    (Euler and Maclaurin): the aliases. Derivatives at the kink are differences of r at 0, δ, 2δ
+    ... What τ = 1 makes is taken off `head` (Gregory's rule, which is bounded however fast r
+    decays); what a recording makes is put on, τ² times the first of `coarser` and τ⁴ times the
+    second.
     """
     spread = scipy.signal.correlate(anti_alias(FINER), anti_alias(FINER))
-    q, reach = 2 * REACH, len(spread) // 2
+    q, reach, n = 2 * REACH, len(spread) // 2, np.arange(KINK)
+    at = reach + FINER * np.arange(q)
+    low, bent = spread[at], (spread[at - 1] - 2 * spread[at] + spread[at + 1]) / 20
+    # D in powers of x, as weights of exp(-x i), i = 0, 1, 2 ...
+    terms = 2 * scipy.special.bernoulli(KINK)[1:] / scipy.special.factorial(n + 1)
+    taylor = (-1.0 * n) ** n[:, None] / scipy.special.factorial(n)[:, None]
+    first, third, every = np.linalg.solve(taylor, (terms * [n == 1, n == 3, n > 0]).T).T
+    bent = np.outer(bent, first)
+    coarser = np.stack([np.outer(low, first), np.outer(low, third) - bent])
     spread = np.pad(spread, (0, -len(spread) % 2**SHORT))
     head = np.zeros((q, len(spread)))
     for lag in range(q):
         np.add.at(head[lag], np.abs(lag * FINER + reach - np.arange(len(spread))), spread)
-    return head, spread.reshape(-1, 2**SHORT)
+    head[:, :KINK] -= np.outer(low, every) - bent
+    return _Folded(head, coarser, spread.reshape(-1, 2**SHORT))
 
 
-def _decimated(powers: Array, rows: Array, start: Array) -> tuple[Array, Array]:
+def _decimated(
+    powers: Array, rows: Array, start: Array, steps: Float[Array, ""]
+) -> tuple[Array, Array]:
     """The first q values of what is low-passed against aliases, and its vector at the lag q; Φ
-    carries to the next point.
+    carries to the next point. Of a signal known at every so many `steps` of them (0: at all times).
 
     `Σ_j ρ_j Φ^j start` and `rows Φ^j start` with j = 2^SHORT a + b: few short steps, then few long
     ones.
     """
-    fold, spread = (jnp.asarray(x, start.dtype) for x in _folded())
+    head, coarser, spread = (jnp.asarray(x, start.dtype) for x in _folded())
     short, long = powers[0].T, powers[SHORT]
     _, columns = jax.lax.scan(lambda x, _: (x @ short, x), start, length=2**SHORT)
     blocks = jnp.tensordot(spread[::-1], columns, 1)
@@ -227,14 +257,16 @@ def _decimated(powers: Array, rows: Array, start: Array) -> tuple[Array, Array]:
     (_, carried), rows = jax.lax.scan(
         lambda x, block: ((x[0] @ long, x[1] @ long.T + block), x[0]), both, blocks
     )
-    return fold @ jnp.einsum("acn,bcn->ab", rows, columns).reshape(-1), carried
+    r = jnp.einsum("acn,bcn->ab", rows, columns).reshape(-1)
+    more = steps**2 * (coarser[0] + steps**2 * coarser[1])
+    return head @ r + more @ r[:KINK], carried
 
 
 def _autocovariance(
-    system: Covariances, interval: float, lags: int, sampling: str
+    system: Covariances, interval: float, lags: int, sampling: str, recorded: Scalar
 ) -> Autocovariance:
     """Autocovariance of the sampled output, good for that many lags; not finite where it does not
-    decay."""
+    decay. `recorded`: the interval of the recording [s] of which it is sampled, if "filtered"."""
     (matrix, rows, start), finer = system, FINER if sampling == "filtered" else 1
     if sampling == "average":
         # Means over the interval: r(0) = 2/Δ² c ∫(Δ-s) e^(Ms) ds v and r(lΔ) = c J Φ^(l-1) J v /
@@ -251,7 +283,9 @@ def _autocovariance(
     count = (lags - 1).bit_length() + finer.bit_length()
     _, powers = jax.lax.scan(lambda power, _: (product(power, power), power), step, length=count)
     if sampling == "filtered":
-        first, following = _decimated(powers, rows, start)
+        first, following = _decimated(
+            powers, rows, start, jnp.asarray(recorded, step.dtype) * finer / interval
+        )
         powers = powers[finer.bit_length() - 1 :]
     # The last power carries an unstable system beyond any bound: no stationary covariance, so none
     # is returned.
@@ -262,7 +296,11 @@ def _autocovariance(
 
 
 def autocovariances(
-    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, lags: int
+    task: AbstractTask,
+    system: Linearisation,
+    settings: SpectrumSettings,
+    lags: int,
+    recorded: Scalar = 0.0,
 ) -> tuple[Autocovariance, list[int]]:
     """Of every independent part of the noise, along a leading axis; which component of the noise
     each belongs to.
@@ -282,7 +320,6 @@ def autocovariances(
         return Covariances(jax.scipy.linalg.block_diag(own.matrix, decaying), rows, start)
 
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *(filled(own) for own, _ in parts))
-    found = jax.vmap(lambda own: _autocovariance(own, 1 / settings.rate, lags, settings.sampling))(
-        stacked
-    )
+    made = functools.partial(_autocovariance, sampling=settings.sampling, recorded=recorded)
+    found = jax.vmap(lambda own: made(own, 1 / settings.rate, lags))(stacked)
     return found, [i for _, i in parts]

@@ -158,11 +158,12 @@ def noise_response(
     system: Linearisation,
     settings: SpectrumSettings,
     samples: Int[Array | np.ndarray, ""] | int,
+    recorded: Scalar = 0.0,
 ) -> tuple[Float[Array, "components bins"], Float[Array, ""]]:
     """Expected Welch power of each component of the noise, and variance of so many low-passed
-    samples about their mean."""
+    samples about their mean. `recorded`: as in `response`."""
     lags = lags_of(settings)
-    each, of = autocovariances(task, system, settings, max(lags, LONGEST))
+    each, of = autocovariances(task, system, settings, max(lags, LONGEST), recorded)
     belongs = np.equal.outer(np.arange(len(task.noise.components)), of).astype(system.A.dtype)
     r = belongs @ jax.vmap(lambda own: own.lagged(lags))(each)
     found = jnp.stack([expected_powers(settings, own) for own in r])
@@ -183,25 +184,27 @@ def response(
     settings: SpectrumSettings,
     window: tuple[float, float],
     samples: Int[Array | np.ndarray, ""] | int | None = None,
+    recorded: Scalar = 0.0,
 ) -> tuple[Moments, Linearisation]:
     """Expected moments of the linearised task in the window, and the linearisation. Not finite
     where it is unstable.
 
     The variance is that of so many samples from the window's begin on, by default as many as it
-    has.
+    has. Where sampling is "filtered", the signal was `recorded` at this interval [s]; 0: it is
+    known at all times.
     """
     samples = samples_in(window, settings) if samples is None else samples
     system = linearise(task)
-    noise, variance = noise_response(task, system, settings, samples)
+    noise, variance = noise_response(task, system, settings, samples, recorded)
     line, swing = harmonic_line(task, system, settings, window, samples)
-    unknown = jnp.full((), jnp.nan, line.dtype)  # the slowest rate has no second derivative
     resonant = tuple(
         own
         for own, part in zip(noise, task.noise.components, strict=True)
         if isinstance(part, ResonantNoise)
     )
     power = jnp.sum(noise, axis=0) + line
-    return Moments(power, line, system.rest, variance + swing, unknown, unknown, resonant), system
+    # Without the slowest rate, which has no second derivative.
+    return Moments(power, line, system.rest, variance + swing, resonant=resonant), system
 
 
 _compiled_response = kept(response)
@@ -212,8 +215,9 @@ def expected_moments(
     settings: SpectrumSettings,
     window: tuple[float, float],
     samples: Int[Array | np.ndarray, ""] | int | None = None,
+    recorded: Scalar = 0.0,
 ) -> tuple[Moments, Linearisation]:
-    """`response`, compiled once for all numbers of samples.
+    """`response`, compiled once for all numbers of samples and intervals of recordings.
 
     Outside a transformation by two programs: that of the linearisation serves all settings, and
     what follows from it all tasks with as many states.
@@ -222,7 +226,7 @@ def expected_moments(
     if all_concrete((task, samples)):
         bare = mechanics(task)
         task = LinearTask.of(bare, linearisation(bare))
-    return _compiled_response(as_arrays(task), settings, window, samples)
+    return _compiled_response(as_arrays(task), settings, window, samples, as_arrays(recorded))
 
 
 def log_variation_sd(

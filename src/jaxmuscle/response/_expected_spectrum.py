@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import all_concrete, is_concrete
 from jaxmuscle.model._task import AbstractTask, require_task
+from jaxmuscle.spectra._decimation import LEAST_RATES
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum
 
@@ -18,6 +19,8 @@ def expected_spectrum(
     task: AbstractTask,
     settings: SpectrumSettings | None = None,
     window: tuple[float, float] = WINDOW,
+    *,
+    recorded_at: float | int | None = None,
 ) -> Spectrum:
     """The expected Welch spectrum of a task's output, to first order in its perturbations: no Monte
     Carlo.
@@ -34,7 +37,9 @@ def expected_spectrum(
     fluctuations.
 
     **Arguments:** `task`; `settings` (the task's own by default); the analysed `window` [s] (only
-    the harmonic's phase and an envelope that changes depend on it).
+    the harmonic's phase and an envelope that changes depend on it); `recorded_at` [Hz], if the
+    settings' sampling is "filtered": the rate of the recording that is sampled, which it must
+    exceed twice. The recording has aliases from half its rate on; by default it has none.
 
     **Returns:** a `Spectrum`, power [unit²/Hz] of shape (bins,); differentiable, also under `jit`
     and `vmap`.
@@ -47,7 +52,8 @@ def expected_spectrum(
     equilibrium the result is not finite, and all else that would be refused gives numbers without
     meaning.
     """
-    moments, settings = _moments(task, "expected_spectrum(task)", settings, window)
+    call = "expected_spectrum(task)"
+    moments, settings = _moments(task, call, settings, window, recorded_at)
     frequency = jnp.asarray(settings.frequency, moments.power.dtype)
     return Spectrum(frequency, moments.power, settings, task.output_unit)
 
@@ -56,6 +62,8 @@ def expected_variation(
     task: AbstractTask,
     settings: SpectrumSettings | None = None,
     window: tuple[float, float] = WINDOW,
+    *,
+    recorded_at: float | int | None = None,
 ) -> Float[Array, ""]:
     """The expected coefficient of variation of a task's output, to first order in its
     perturbations: no Monte Carlo.
@@ -75,12 +83,16 @@ def expected_variation(
     **Returns:** a fraction, not a percentage; differentiable, also under `jit` and `vmap`.
     **Raises** and warns as `expected_spectrum`.
     """
-    moments, _ = _moments(task, "expected_variation(task)", settings, window)
+    moments, _ = _moments(task, "expected_variation(task)", settings, window, recorded_at)
     return jnp.sqrt(moments.variance) / jnp.abs(moments.mean)
 
 
 def _moments(
-    task: AbstractTask, call: str, settings: SpectrumSettings | None, window: tuple[float, float]
+    task: AbstractTask,
+    call: str,
+    settings: SpectrumSettings | None,
+    window: tuple[float, float],
+    recorded_at: float | int | None,
 ) -> tuple[Moments, SpectrumSettings]:
     """The expected moments, after what has to be refused or said."""
     require_task(task, call)
@@ -93,11 +105,19 @@ def _moments(
     start, stop = window
     if not 0 <= start < stop:
         raise ValueError(f"window = {window}: give its start and its end [s], 0 <= start < end")
+    least = LEAST_RATES * settings.rate
+    if recorded_at is not None and (settings.sampling != "filtered" or not recorded_at >= least):
+        raise ValueError(
+            f"recorded_at={recorded_at!r}: give a rate of {least:g} Hz or more, with settings whose"
+            f" sampling is 'filtered' (here {settings.sampling!r}); or leave it out"
+        )
     concrete = all_concrete(task)
     if concrete:
         check_line(task, settings)
         check_inputs(task, window)
-    moments, system = expected_moments(task, settings, window)
+    moments, system = expected_moments(
+        task, settings, window, None, 0.0 if recorded_at is None else 1 / recorded_at
+    )
     if is_concrete(moments.power):
         check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
         check_power(task, moments)

@@ -11,6 +11,7 @@ from scipy.special import digamma, gammaincinv, ndtr, polygamma, stdtrit
 
 from jaxmuscle._common.arrays import is_concrete
 
+from ._decimation import LEAST_RATES
 from ._settings import LONGEST, WINDOW, SpectrumSettings, samples_in, tapers_of
 
 LEAST = 1e-3  # share of a bin that scatters, at least
@@ -206,6 +207,13 @@ def trial_samples(target: Any) -> int:
     if target.segments is None:
         return samples_in(WINDOW, target.settings)
     return round(np.mean([samples_of(k, target.settings) for k in target.segments]))
+
+
+def recorded_interval(data: Any, settings: SpectrumSettings) -> float:
+    """Interval [s] at which a target or recording was sampled first, whose aliases its spectrum
+    has; 0 where it has none."""
+    rate = data.recorded_at
+    return 0.0 if rate is None or rate < LEAST_RATES * settings.rate else 1 / rate
 
 
 def standardised(

@@ -11,9 +11,8 @@ from jaxtyping import Array, Float
 from jaxmuscle._common.programs import kept
 
 REACH = 10  # samples to either side
-# points in a sampling interval where a signal is known at all times: aliases come from 7.4 times
-# the rate on
-FINER = 8
+FINER = 8  # points in a sampling interval where the low-pass takes a signal known at all times
+LEAST_RATES = 2  # of the spectrum, in the rate of a recording whose aliases are known
 
 
 @functools.cache

@@ -198,7 +198,7 @@ class PosteriorDensity(eqx.Module):
         task, model = self.task(s, part), self.likelihood.objective.parts[part].model
         assert isinstance(model, Linear)
         system = systems[part] if part in systems else linearise(task)
-        power, variance = noise_response(task, system, task.settings, model.samples)
+        power, variance = noise_response(task, system, task.settings, model.samples, model.recorded)
         size = harmonic_size(task, system.A.dtype)
         size = jnp.stack([jnp.real(size), jnp.imag(size)])
         power = jnp.sum(power, axis=0)[model.chosen] * model.correction.power

@@ -154,8 +154,20 @@ export function lagged({ matrix, rows, start }, settings, lags) {
     rows,
     FINER * (lags - 1) + reach + 1,
   );
-  return Float64Array.from({ length: lags }, (_, l) => convolvedAt(fine, spread, FINER * l));
+  // The signal is known at all times: near lag 0, where r has a kink, the sum is made an integral (Gregory's rule).
+  const kink = KINK.map((weights) => weights.reduce((sum, w, i) => sum + w * fine[i], 0));
+  return Float64Array.from({ length: lags }, (_, l) => {
+    const k = FINER * l,
+      bent = k + 1 < spread.length ? spread[Math.abs(k - 1)] - 2 * spread[k] + spread[k + 1] : 0;
+    return convolvedAt(fine, spread, k) - (spread[k] ?? 0) * kink[0] + bent * kink[1];
+  });
 }
+
+// Weights of r at 0, δ, 2δ ...: what a sum in steps of δ exceeds the integral by, and -δ r' / 120.
+const KINK = [
+  [0.43962080711212653, -1.3001848720338303, 2.416610850569184, -3.621803551386885, 3.9911629439233605, -3.151921872494789, 1.735732122815456, -0.6335751362834696, 0.13793040774811607, -0.013571699969269414],
+  [0.02357473544973545, -0.075, 0.15, -0.23333333333333334, 0.2625, -0.21000000000000002, 0.11666666666666667, -0.04285714285714286, 0.009375, -0.0009259259259259259],
+];
 
 // Σ_j ρ(|j|) r(|l - j|)
 export function convolvedAt(r, spread, l) {
