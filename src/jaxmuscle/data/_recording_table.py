@@ -4,10 +4,13 @@ import difflib
 import functools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+
+from jaxmuscle._common.text import printable
 
 from ._recording_channels import Channel, numbers
 from ._units import name_and_unit
@@ -28,7 +31,9 @@ class Table(NamedTuple):
 
     `columns` are functions, so that only those that are asked for are read; `named` is false where
     names are only numbers; `rates` [Hz] and `units` by column, where the file states them; `words`
-    are columns that hold no numbers; `place` is how messages call a row.
+    are columns that hold no signals; `place` is how messages call a row; `notices` say what the
+    reader decided; `clocks` are the columns of times that belong to others, by these; `aliases` are
+    further names of columns; `sheet` is that of a workbook with several.
     """
 
     file: str
@@ -38,6 +43,21 @@ class Table(NamedTuple):
     units: Mapping[str, str] = {}
     words: frozenset[str] = frozenset()
     place: Callable[[int], str] = "sample {}".format
+    notices: tuple[str, ...] = ()
+    clocks: Mapping[str, str] = {}
+    aliases: Mapping[str, str] = {}
+    sheet: str = ""
+
+    @property
+    def name(self) -> str:
+        """What a recording of it is called: the file, and the sheet of several."""
+        stem = Path(self.file.removesuffix(self.of_sheet)).stem
+        return printable(f"{stem} {self.sheet}".strip())
+
+    @property
+    def of_sheet(self) -> str:
+        """What stands behind the name of the file in messages."""
+        return f", sheet {self.sheet}" if self.sheet else ""
 
 
 def channels_table(file: str, channels: Sequence[Channel], *, named: bool = True) -> Table:
@@ -53,6 +73,38 @@ def channels_table(file: str, channels: Sequence[Channel], *, named: bool = True
         named,
         rates,
         {channel.name: channel.unit for channel in channels if channel.unit},
+        aliases={channel.alias: channel.name for channel in channels if channel.alias},
+    )
+
+
+def merged(file: str, tables: Sequence[Table]) -> Table:
+    """The tables of a file as one: columns that several have are told apart by the block."""
+    if len(tables) == 1:
+        return tables[0]
+    often = [name for table in tables for name in table.columns]
+    new = [
+        {
+            name: name if often.count(name) == 1 else f"{name}, block {block}"
+            for name in table.columns
+        }
+        for block, table in enumerate(tables, 1)
+    ]
+
+    def joined(part: Callable[[Table], Mapping[str, Any]]) -> dict[str, Any]:
+        return {
+            names[name]: value
+            for names, table in zip(new, tables, strict=True)
+            for name, value in part(table).items()
+        }
+
+    return Table(
+        file,
+        joined(lambda table: table.columns),
+        True,
+        joined(lambda table: table.rates),
+        joined(lambda table: table.units),
+        frozenset(joined(lambda table: dict.fromkeys(table.words))),
+        notices=tuple(dict.fromkeys(said for table in tables for said in table.notices)),
     )
 
 
@@ -119,6 +171,9 @@ def find(table: Table, column: str | int, argument: str = "column") -> str:
     """
     names = list(table.columns)
     exact = _find(names, column)
+    if exact is None and table.aliases:
+        exact = _find(list(table.aliases), column)
+        exact = None if exact is None else table.aliases[exact]
     if exact is not None:
         return exact
     stem = str(column).casefold()
@@ -127,7 +182,7 @@ def find(table: Table, column: str | int, argument: str = "column") -> str:
             f"{table.file}: {argument}={column!r} is a point of three columns; give axis='x', 'y',"
             " 'z' or 'principal'"
         )
-    if any(name.casefold() == f"{stem}:0" for name in names):
+    if any(name.casefold() == f"{stem}:0" for name in (*names, *table.aliases)):
         raise ValueError(
             f"{table.file}: {argument}={column!r} has several columns; choose one, as {column}:0"
             " (counted from 0)"
