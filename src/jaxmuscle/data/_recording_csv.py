@@ -43,7 +43,9 @@ def read_csv(data: bytes, file: str, skip_rows: int = 0) -> Table:
             return table
         blocks = dialect.blocks and dialect.blocks(data)
         if blocks:
-            return merged(file, [_block(each, file, skip_rows) for each in blocks])
+            # "Frame#" is the name of a column
+            parts = [each._replace(data=each.data.replace(b"#", b"")) for each in blocks]
+            return merged(file, [_block(each, file, skip_rows) for each in parts])
     return _block(Block(data, 0, head_of), file, skip_rows)
 
 

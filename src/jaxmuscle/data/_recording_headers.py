@@ -98,9 +98,7 @@ def _are_units(row: list[str], names: list[str]) -> bool:
 def _stated_rate(lines: list[str]) -> tuple[float | None, str]:
     """The rate [Hz] in a line `Sampling rate (Hz): 1000` or `Interval, 0.001 s`, and this line."""
     for line in lines:
-        key, _, rest = re.sub(
-            r"[\t;=]|,(?=\D)|:", "\0", line.strip().strip('"'), count=1
-        ).partition("\0")
+        key, _, rest = re.sub(r"[\t;=:,]", "\0", line.strip(' "'), count=1).partition("\0")
         value = re.fullmatch(r"([\d.,]*\d(?:[eE][+-]?\d+)?)[\s,;]*(.*?)", rest.strip('\t ,;:="'))
         name, _, unit = key.strip(' "').partition("[" if "[" in key else "(")
         if value is None or not is_number(value[1], None):

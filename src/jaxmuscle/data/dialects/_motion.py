@@ -7,7 +7,7 @@ from .._text_tables import cells_of
 from ._dialect import Above, Block, Dialect, Head, entries_of, frequency, triples
 
 _LEAD = {0: [], 1: ["Sample"], 2: ["Frame", "Time"]}
-_COUNTERS = ("frame", "frame#", "sample")
+_COUNTERS = ("frame", "sample")
 # OpenSim writes SI units; what a column is stands in its name
 _SI = (
     (re.compile(r".*force_?v?[xyz]|.*_v[xyz]"), "N"),

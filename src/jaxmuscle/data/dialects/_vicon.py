@@ -10,7 +10,7 @@ _BLOCK = re.compile(
     rb'[,;\t]*\n"?([\d.]+)"?[,;\t]*(?:hz)?[,;\t]*\n',
     re.IGNORECASE | re.MULTILINE,
 )
-_COUNTERS = ("frame", "sub frame", "sample #", "field #")
+_COUNTERS = ("frame", "sub frame", "sample", "field")
 POINTS = (b"trajectories", b"joints", b"segments", b"model outputs")
 
 
