@@ -316,8 +316,7 @@ _TEXTS = {
         "Frame,Sub Frame,Fz\n,,N\n" + _rows(range(ROWS), [0] * ROWS, X, sign=",")
     ),
     "qualisys": (
-        "NO_OF_FRAMES\t120\nFREQUENCY\t100\nDATA_INCLUDED\t3D\nMARKER_NAMES\ta\n"
-        + _rows(X, Y, X)
+        "NO_OF_FRAMES\t120\nFREQUENCY\t100\nDATA_INCLUDED\t3D\nMARKER_NAMES\ta\n" + _rows(X, Y, X)
     ),
     "trc": (
         "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tUnits\n100\t100\tmm\n"

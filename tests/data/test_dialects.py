@@ -12,8 +12,10 @@ import scipy.io
 
 from jaxmuscle._common.inputs import ALLOWED
 from jaxmuscle.data._as_target import is_recording
+from jaxmuscle.data._recording_channels import Channel
 from jaxmuscle.data._recording_choice import signals
 from jaxmuscle.data._recording_files import load_columns, load_recording, read_table
+from jaxmuscle.data._recording_table import channels_table
 from jaxmuscle.data._trials import load_recordings
 
 N, RATE = 120, 100
@@ -198,6 +200,14 @@ TEXTS = {  # content, ending, column, unit
         "mm",
     ),
     "Qualisys, analog": (QUALISYS_ANALOG + rows(X, Y, sign="\t"), "tsv", "Force", "N"),
+    "Qualisys, force": (
+        QUALISYS_ANALOG.replace("CHANNEL_NAMES\tForce (N)\tEMG (mV)", "FORCE_PLATE_NAME\tPlate 1")
+        + "SAMPLE\tTIME\tForce_X\tForce_Z\tMoment_X\n"
+        + rows(np.arange(1, N + 1), TIME, Y, X, Z, sign="\t"),
+        "tsv",
+        "Force_Z",
+        "N",
+    ),
     "OpenSim": (OPENSIM + rows(TIME, X, Y, sign="\t"), "mot", "ground_force_vy", "N"),
     "OpenSim, position": (OPENSIM + rows(TIME, Y, X, sign="\t"), "sto", "ground_force_py", "m"),
     "trc": (
@@ -271,6 +281,32 @@ TEXTS = {  # content, ending, column, unit
     "rate in kHz": ("Frequency;0,1 kHz\nForce [N];EMG\n" + rows(X, Y, sign=";"), "csv", 0, "N"),
     "step in words": ("Subject: 3\nInterval: 10 ms\nForce [N]\n" + rows(X), "txt", None, "N"),
     "step in s": ("Subject,3\ndt (s),0.01\nForce [N],EMG\n" + rows(X, Y), "csv", "Force", "N"),
+    "rate in kHz, decimal comma": (
+        "Sampling Frequency\t0,100 kHz\nForce [N]\tEMG\n" + rows(X, Y, sign="\t"),
+        "txt",
+        0,
+        "N",
+    ),
+    "rate in a comment": (
+        "# fs: 100\n# Force [N]\n" + rows(X),
+        "txt",
+        None,
+        None,
+    ),
+    "rate behind a sign": ("%Sample Rate = 100 Hz\nForce [N], EMG\n" + rows(X, Y), "txt", 0, "N"),
+    "rate beside another frequency": (
+        "Frequency: 50 Hz\nSampling frequency: 100 Hz\nForce [N]\n" + rows(X),
+        "txt",
+        None,
+        "N",
+    ),
+    "times of their own": (
+        "Time Force (s),Force (N),Time EMG (s),EMG\n" + rows(TIME, X, TIME / 2, Y),
+        "csv",
+        "Force",
+        "N",
+    ),
+    "times of one name": ("t,EMG,t,Force (N)\n" + rows(TIME / 2, Y, TIME, X), "csv", "Force", "N"),
     "row of rates": ("Force (N),EMG\n100 Hz,100 Hz\n" + rows(X, Y), "csv", "Force", "N"),
 }
 
@@ -313,6 +349,18 @@ def test_packets_of_labview_without_times_are_blocks(tmp_path):
     second = load_recording(path, column="Force, block 2")
     np.testing.assert_array_equal(second.whole, X[N // 2 :])
     assert (second.rate, second.unit) == (RATE, "N")
+
+
+def test_packets_of_labview_whose_times_start_again_are_blocks(tmp_path):
+    names = "X_Value\tForce\tEMG\tComment"
+    again = np.concatenate([TIME[: N // 2], TIME[: N // 2] * 2])
+    content = lvm("One", names, again, X, Y, several="Yes", packets=2)
+    first, second = (
+        load_recording(write(tmp_path, content, "trial.lvm"), column=f"Force, block {i}")
+        for i in (1, 2)
+    )
+    np.testing.assert_array_equal(np.concatenate([first.whole, second.whole]), X)
+    assert (first.rate, second.rate) == (RATE, RATE / 2)
 
 
 def test_lines_of_packets_keep_their_numbers(tmp_path):
@@ -409,8 +457,23 @@ def test_a_rate_in_words_gives_way_to_times(tmp_path):
         assert not any("as the header says" in notice for notice in recording.notices)
 
 
+def test_a_rate_with_a_comma_for_thousands(tmp_path):
+    path = write(tmp_path, "Sampling rate: 2,048 Hz\nForce [N]\n" + rows(X), "a.txt")
+    recording = load_recording(path)
+    assert recording.rate == 2048
+    assert "rate 2048 Hz, as the header says: Sampling rate: 2,048 Hz" in recording.notices
+
+
 @pytest.mark.parametrize(
-    "line", ["Stimulation frequency: 30", "Rate: fast", "Interval: 3 weeks", "Age: 27", "fs:"]
+    "line",
+    [
+        "Stimulation frequency: 30",
+        "Rate: fast",
+        "Interval: 3 weeks",
+        "Age: 27",
+        "fs:",
+        "Sampling rate: 100 Hz\nSampling rate: 200 Hz",
+    ],
 )
 def test_other_lines_state_no_rate(line, tmp_path):
     path = write(tmp_path, f"{line}\nForce [N]\n" + rows(X), "a.txt")
@@ -607,6 +670,11 @@ MATS = {  # variables, column, unit, tolerance
         "Force",
         "kgf",
     ),
+    "times of a struct": (
+        {"trial": {"force": X, "time": TIME, "units": "kg"}, "other": {"emg": Y, "t": TIME * 3}},
+        "trial.force",
+        "kgf",
+    ),
     "unit of a struct": (
         {"trial": {"force": X, "time": TIME, "units": "kg", "fs": 100.0}},
         "trial.force",
@@ -726,6 +794,7 @@ def test_packed_texts(tmp_path, monkeypatch):
         (gzip.compress(bytes(range(256)) * 99), "holds no text with rows of numbers; unpack it"),
         (gzip.compress(text.encode())[:50], "cannot be unpacked: "),
         (b"\x1f\x8b" + bytes(99), "cannot be unpacked: "),
+        (text.encode(), "cannot be unpacked: Not a gzipped file"),
     ):
         with pytest.raises(ValueError, match=message):
             load_recording(write(tmp_path, content, "bad.csv.gz"))
@@ -839,3 +908,11 @@ def test_other_files_have_no_sheets(name, tmp_path):
     write(tmp_path, "time,force\n" + rows(TIME, X), name) if name == "a.csv" else np.savez(path, X)
     with pytest.raises(ValueError, match=rf"sheet=1: leave it out: {name} has no sheets"):
         load_recording(path, sheet=1)
+
+
+def test_analog_channels_are_named_before_points():
+    """A .c3d has dozens of points."""
+    names = [f"{point}_{axis}" for point in ("finger", "thumb") for axis in "xyz"]
+    channels = [Channel(name, X, 100.0) for name in [*names, "EMG 1", "EMG 2"]]
+    with pytest.raises(ValueError, match="choose one with `column`: EMG 1, EMG 2, finger_x, finger_y"):
+        load_recording(channels_table("trial.c3d", channels))

@@ -18,7 +18,6 @@ from ._text_tables import TEXT, beginning, cells_of, is_number
 from ._trials import Trials, load_recordings
 
 POINTS = 500  # more than a figure of a spectrum has
-TARGETS = (".toml", ".json", ".tar")
 
 
 def as_target(
@@ -120,7 +119,7 @@ def is_recording(path: str | os.PathLike[str]) -> bool:
     path = Path(path).expanduser()
     kind = path.suffix.lower()
     if kind not in TEXT or not path.is_file():
-        return (kind in KINDS and kind != ".csv") or (kind not in TARGETS and is_text(path))
+        return (kind in KINDS and kind != ".csv") or is_text(path)
     rows, names, delimiter = beginning(path)
     if not rows:
         return kind != ".csv"

@@ -74,8 +74,9 @@ def _block(block: Block, file: str, skip_rows: int) -> Table:
     at = _start(cells, width, delimiter)
     if at is None:
         raise ValueError(f"{file}: holds a header (line {rows[0][0]}) but no data")
+    length = block.data.count(b"\n")
     above = Above(
-        notes, rows[:at], cells[: at + 1], width, delimiter, block.data.count(b"\n"), file
+        notes, rows[:at], cells[: at + 1], width, delimiter, rows[at][0] - before, length, file
     )
     head = block.head(above) or head_of(above)
     at += head.counts
@@ -233,14 +234,16 @@ def _column(
 def _clocks(given: list[str], known: list[str], units: Mapping[str, str]) -> dict[str, str]:
     """The time of every column where there are several columns of times, each before its own: they
     have one name, or that of what follows."""
-    times = [j for j, name in enumerate(known) if seconds(units.get(name)) is not None]
+    bare_names = [name_and_unit(name)[0] for name in given]
+    times = [
+        j
+        for j, name in enumerate(known)
+        if seconds(units.get(name)) is not None or bare_names[j] in ("time", "t")
+    ]
     if len(times) < 2 or times[0] != 0:
         return {}
-    bares = [name_and_unit(given[j])[0] for j in times]
-    own = [
-        j + 1 < len(given) and _TIME_OF.sub("", bare) == name_and_unit(given[j + 1])[0]
-        for j, bare in zip(times, bares, strict=True)
-    ]
+    bares = [bare_names[j] for j in times]
+    own = [_TIME_OF.sub("", bare_names[j]) == "".join(bare_names[j + 1 : j + 2]) for j in times]
     if len(set(bares)) > 1 and not all(own):
         return {}
     return {name: known[max(t for t in times if t <= j)] for j, name in enumerate(known)}

@@ -24,6 +24,7 @@ from .dialects._dialects import EXPORTS
 BOOKS = (".xlsx", ".xlsm")
 KINDS = (*TEXT, ".xlsx", ".mat", ".npy", ".npz", ".c3d", ".edf", ".bdf", ".tdms", ".acq", ".smr")
 KINDS = (*KINDS, ".xlsm", ".gz")
+TARGETS = (".toml", ".json", ".tar")
 ROWS = 90  # that the shortest recording has
 
 
@@ -204,14 +205,14 @@ def read_tables(
         "give a number of lines",
     )
     instead = f"a recording ({', '.join(KINDS)})"
-    text = is_text(file) or (kind in TEXT and not is_packed(file))
+    text = kind in TEXT or is_text(file)
     book = kind in BOOKS and not text
     rows = text or book or kind == ".gz"
     require(skip_rows == 0 or rows, "skip_rows", skip_rows, f"leave it out: {kind} has no lines")
     require(sheet is None or book, "sheet", sheet, f"leave it out: {file.name} has no sheets")
     if text:
         return [read_csv(read_bytes(file, instead=instead), str(file), skip_rows)]
-    if is_packed(file):
+    if kind == ".gz":
         return [read_csv(_unpacked(file, instead), str(file), skip_rows)]
     if kind not in KINDS:
         looked_at(file, instead=instead)
@@ -228,22 +229,13 @@ def read_tables(
 
 
 def is_text(file: Path) -> bool:
-    """Whether a file of no kind that is read apart is a text with rows of numbers."""
-    apart = file.suffix.lower() in KINDS and file.suffix.lower() != ".mat"
-    return not apart and file.is_file() and holds_text(_begin(file))
-
-
-def is_packed(file: Path) -> bool:
-    """Whether a file is packed by gzip."""
-    return file.suffix.lower() == ".gz" and file.is_file() and _begin(file)[:2] == b"\x1f\x8b"
-
-
-def _begin(file: Path) -> bytes:
-    try:
-        with file.open("rb") as stream:
-            return stream.read(LOOK)
-    except OSError:
-        return b""
+    """Whether a file is a text with rows of numbers, though its ending does not say so."""
+    kind = file.suffix.lower()
+    if (kind in (*TARGETS, *KINDS) and kind != ".mat") or not file.is_file():
+        return False
+    with contextlib.suppress(OSError), file.open("rb") as stream:
+        return holds_text(stream.read(LOOK))
+    return False
 
 
 def _unpacked(file: Path, instead: str) -> bytes:

@@ -182,14 +182,14 @@ def read_c3d(path: str, most: int) -> list[Channel]:
     lost = np.asarray(content["data"]["meta_points"]["residuals"])[0] < 0
     xyz[:, lost] = np.nan
     unit = _first(point, "UNITS", 0)
-    channels = np.asarray(content["data"]["analogs"])[0]
-    for i, label in enumerate(_labels(analog, len(channels))):
-        found.append(Channel(label, channels[i], _rate(analog), _first(analog, "UNITS", i)))
     for i, label in enumerate(_labels(point, xyz.shape[1])):
         found += [
             Channel(f"{label}_{axis}", values, _rate(point), unit)
             for axis, values in zip("xyz", xyz[:, i], strict=True)
         ]
+    channels = np.asarray(content["data"]["analogs"])[0]
+    for i, label in enumerate(_labels(analog, len(channels))):
+        found.append(Channel(label, channels[i], _rate(analog), _first(analog, "UNITS", i)))
     if not found:
         raise ValueError("holds neither points nor analog channels")
     return found

@@ -23,6 +23,7 @@ _HERTZ = {
     1.0: ("", "hz", "s/s", "sps", "1/s", "samples/s", "samples/sec", "samples per second"),
     1e3: ("khz", "ks/s"),
 }
+_SHORT = ("fs", "fsamp", "sfreq", "abtastrate", "abtastfrequenz")
 _UNITLIKE = re.compile(r"[^\W\d_]{1,3}|[%°µ\[(].*|.*[/^²·*].*")
 
 
@@ -38,7 +39,7 @@ def head_of(above: Above) -> Head:
 def _names(above: Above) -> Head:
     """The last row of words, but for rows of units and of rates below it."""
     if not above.rows:
-        return Head()
+        return _with_rate(Head(), above)
     rows, width = above.cells[:-1], above.width
     number, row = above.rows[-1][0], rows[-1]
     if len(row) != width:
@@ -65,9 +66,14 @@ def _names(above: Above) -> Head:
     names = rows[-1]
     if not units and sum(map(_is_unit, names)) > width / 2 and seconds(names[0]):
         units = names  # of a dynamometer, which names its columns by their units
-    rate, said = (None, "") if rates else _stated_rate([body for _, body in above.rows])
-    notices = (f"rate {rate:g} Hz, as the header says: {said}",) if rate else ()
-    return Head(names, units, rate, rates=rates, notices=notices)
+    return Head(names, units, rates=rates) if rates else _with_rate(Head(names, units), above)
+
+
+def _with_rate(head: Head, above: Above) -> Head:
+    rate, said = _stated_rate(above)
+    if not rate:
+        return head
+    return head._replace(rate=rate, notices=(f"rate {rate:g} Hz, as the header says: {said}",))
 
 
 def _joined(row: list[str], width: int) -> list[str]:
@@ -95,20 +101,29 @@ def _are_units(row: list[str], names: list[str]) -> bool:
     )
 
 
-def _stated_rate(lines: list[str]) -> tuple[float | None, str]:
-    """The rate [Hz] in a line `Sampling rate (Hz): 1000` or `Interval, 0.001 s`, and this line."""
-    for line in lines:
-        key, _, rest = re.sub(r"[\t;=:,]", "\0", line.strip(' "'), count=1).partition("\0")
+def _stated_rate(above: Above) -> tuple[float | None, str]:
+    """The rate [Hz] in a line `Sampling rate (Hz): 1000` or `Interval, 0.001 s`, also of comments,
+    and this line; none where two such lines differ."""
+    comments = [line.note for line in above.lines if line.note and line.number <= above.first]
+    found: dict[bool, dict[float, str]] = {True: {}, False: {}}
+    for line in [*(body for _, body in above.rows), *comments]:
+        key, _, rest = re.sub(r"[\t;=:,]", "\0", line.strip(' "%'), count=1).partition("\0")
         value = re.fullmatch(r"([\d.,]*\d(?:[eE][+-]?\d+)?)[\s,;]*(.*?)", rest.strip('\t ,;:="'))
         name, _, unit = key.strip(' "').partition("[" if "[" in key else "(")
-        if value is None or not is_number(value[1], None):
-            continue
-        number, found = number_in(value[1], None), value[2].strip(' ";,\t') or unit.strip(" )]")
-        name = name.strip().casefold()
-        scale = next((s for s, units in _HERTZ.items() if found.casefold() in units), None)
-        if _RATE.fullmatch(name) and scale and number > 0:
-            return number * scale, " ".join(line.split())
-        step = seconds(found) if found else 1.0
-        if _STEP.fullmatch(name) and step and number > 0:
-            return 1 / (number * step), " ".join(line.split())
-    return None, ""
+        if value and is_number(value[1], None):
+            unit = value[2].strip(' ";,\t') or unit.strip(" )]")
+            name = name.strip().casefold()
+            if rate := _rate(name, value[1], unit.casefold()):
+                found["sampl" in name or name in _SHORT][rate] = " ".join(line.split())
+    sure = found[True] or found[False]
+    return next(iter(sure.items())) if len(sure) == 1 else (None, "")
+
+
+def _rate(name: str, value: str, unit: str) -> float | None:
+    scale = next((scale for scale, units in _HERTZ.items() if unit in units), None)
+    number = number_in(value, None)
+    if _RATE.fullmatch(name) and scale:
+        thousands = scale * number < 24 and re.fullmatch(r"[1-9]\d{0,2}(,\d{3})+", value)  # 2,048
+        return scale * (float(value.replace(",", "")) if thousands else number)
+    step = seconds(unit) if unit else 1.0
+    return 1 / (number * step) if _STEP.fullmatch(name) and step and number > 0 else None

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxmuscle._common.text import printable
 
 from ._recording_channels import Channel, numbers
-from ._units import name_and_unit
+from ._units import name_and_unit, seconds
 
 TRIPLES = (
     ("_x", "_y", "_z"),
@@ -24,6 +24,7 @@ TRIPLES = (
     (":0", ":1", ":2"),
 )
 AXES = ("x", "y", "z")
+_COORDINATE = re.compile(r"[_.: ][xyz]$", re.IGNORECASE)
 
 
 class Table(NamedTuple):
@@ -67,12 +68,25 @@ def channels_table(file: str, channels: Sequence[Channel], *, named: bool = True
         for channel in channels
     }
     rates = {channel.name: channel.rate for channel in channels if channel.rate is not None}
+    # of a struct that states no rate
+    times = {
+        stem: name
+        for name in columns
+        for stem, _, last in [name.rpartition(".")]
+        if stem and last.casefold() in ("time", "t")
+    }
+    clocks = {
+        name: time
+        for name in columns
+        if name not in rates and (time := times.get(name.rpartition(".")[0])) not in (None, name)
+    }
     return Table(
         file,
         columns,
         named,
         rates,
         {channel.name: channel.unit for channel in channels if channel.unit},
+        clocks=clocks,
         aliases={channel.alias: channel.name for channel in channels if channel.alias},
     )
 
@@ -82,30 +96,23 @@ def merged(file: str, tables: Sequence[Table]) -> Table:
     if len(tables) == 1:
         return tables[0]
     often = [name for table in tables for name in table.columns]
-    new = [
-        {
+    columns: dict[str, Any] = {}
+    rates, units, clocks = dict[str, float](), dict[str, str](), dict[str, str]()
+    words: set[str] = set()
+    for block, table in enumerate(tables, 1):
+        new = {
             name: name if often.count(name) == 1 else f"{name}, block {block}"
             for name in table.columns
         }
-        for block, table in enumerate(tables, 1)
-    ]
-
-    def joined(part: Callable[[Table], Mapping[str, Any]]) -> dict[str, Any]:
-        return {
-            names[name]: value
-            for names, table in zip(new, tables, strict=True)
-            for name, value in part(table).items()
-        }
-
-    return Table(
-        file,
-        joined(lambda table: table.columns),
-        True,
-        joined(lambda table: table.rates),
-        joined(lambda table: table.units),
-        frozenset(joined(lambda table: dict.fromkeys(table.words))),
-        notices=tuple(dict.fromkeys(said for table in tables for said in table.notices)),
-    )
+        times = [name for name in new if seconds(table.units.get(name)) is not None]
+        own = table.clocks or {name: time for time in times[:1] for name in new if name != time}
+        columns |= {new[name]: column for name, column in table.columns.items()}
+        rates |= {new[name]: rate for name, rate in table.rates.items()}
+        units |= {new[name]: unit for name, unit in table.units.items()}
+        clocks |= {new[name]: new[time] for name, time in own.items()}
+        words |= {new[name] for name in table.words}
+    said = tuple(dict.fromkeys(notice for table in tables for notice in table.notices))
+    return Table(file, columns, True, rates, units, frozenset(words), notices=said, clocks=clocks)
 
 
 def frame_table(frame: Any) -> Table:
@@ -152,9 +159,10 @@ def units_of(names: Iterable[str]) -> dict[str, str]:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Names for a message: columns 0 to n of one variable as a range, and not more than 30."""
+    """Names for a message: columns 0 to n of one variable as a range, and not more than 30; those
+    of points last, of which there are many."""
     groups: dict[str, list[str]] = {}
-    for name in names:
+    for name in sorted(names, key=lambda name: _COORDINATE.search(name) is not None):
         stem, _, index = name.rpartition(":")
         groups.setdefault(stem if stem and index.isdigit() else name, []).append(name)
     short = [

@@ -34,13 +34,14 @@ class Head(NamedTuple):
 
 class Above(NamedTuple):
     """What stands above the numbers: all `lines`; the `rows` that are not empty, and their `cells`,
-    the last ones those of the first row of numbers. A text has `length` lines."""
+    the last ones those of the first row of numbers, in line `first`. A text has `length` lines."""
 
     lines: list[Line]
     rows: list[tuple[int, str]]
     cells: list[list[str]]
     width: int
     delimiter: str | None
+    first: int
     length: int
     file: str
 

@@ -1,10 +1,12 @@
 """LabVIEW's measurement file (.lvm): a header, and one for each packet of samples."""
 
 import functools
+import itertools
+import math
 import re
 
-from .._text_tables import cells_of
-from ._dialect import Above, Block, Dialect, Head, number, per_second
+from .._text_tables import cells_of, is_number, number_in
+from ._dialect import Above, Block, Dialect, Head, per_second
 
 _END = re.compile(rb"^\*\*\*End_of_Header\*\*\*[^\n]*\n", re.MULTILINE)
 _AGAIN = re.compile(rb"^Channels[\t,]", re.MULTILINE)
@@ -26,8 +28,8 @@ def _blocks(data: bytes) -> list[Block] | None:
     stated = [_stated(header) for header in headers]
     parts = [_without_comments(data[start:stop]) for start, stop in zip(starts, stops, strict=True)]
     names = [part.lstrip(b"\n\t ").partition(b"\n")[0] for part in parts]
-    timed = re.search(rb"\n[^\s,][^\n]*", parts[0].lstrip(b"\n\t ")) is not None
-    if timed and len(set(names)) == 1:
+    times = [_first_time(part) for part in parts]
+    if len(set(names)) == 1 and all(a < b for a, b in itertools.pairwise(times)):
         # what stands between the packets becomes empty lines, so that lines keep their numbers
         rows = [parts[0]]
         for k in range(1, len(parts)):
@@ -43,6 +45,13 @@ def _blocks(data: bytes) -> list[Block] | None:
         Block(part, data.count(b"\n", 0, start), functools.partial(_head, entries))
         for part, start, entries in zip(parts, starts, stated, strict=True)
     ]
+
+
+def _first_time(part: bytes) -> float:
+    """The first cell below the names; NaN where it is empty."""
+    lines = part.lstrip(b"\n\t ").split(b"\n", 2)
+    cell = re.split(rb"[\t,;]", lines[1])[0].decode("utf-8", "replace") if len(lines) > 1 else ""
+    return number_in(cell, None) if is_number(cell, None) else math.nan
 
 
 def _stated(header: bytes) -> dict[str, list[str]]:
@@ -81,7 +90,7 @@ def _head(stated: dict[str, list[str]], above: Above) -> Head | None:
     rates, units, dimensions = [], [], []
     for j in range(len(names)):
         step, unit, dimension = ("", "", "") if j in times else next(spoken)
-        rates.append(per_second(float(step.replace(",", "."))) if _numeric(step) else None)
+        rates.append(per_second(number_in(step, None)) if is_number(step, None) else None)
         units.append(unit)
         dimensions.append(dimension)
     for j in times:
@@ -91,13 +100,6 @@ def _head(stated: dict[str, list[str]], above: Above) -> Head | None:
 
 def _padded(stated: dict[str, list[str]], key: str, width: int) -> list[str]:
     return [*stated.get(key, []), *[""] * width][:width]
-
-
-def _numeric(cell: str) -> bool:
-    try:
-        return number(float(cell.replace(",", "."))) is not None
-    except ValueError:
-        return False
 
 
 LABVIEW = Dialect(blocks=_blocks)

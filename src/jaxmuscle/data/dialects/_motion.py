@@ -8,6 +8,7 @@ from ._dialect import Above, Block, Dialect, Head, entries_of, frequency, triple
 
 _LEAD = {0: [], 1: ["Sample"], 2: ["Frame", "Time"]}
 _COUNTERS = ("frame", "sample")
+_PLATE = (("force_", "N"), ("moment_", "N m"), ("cop_", "mm"))
 # OpenSim writes SI units; what a column is stands in its name
 _SI = (
     (re.compile(r".*force_?v?[xyz]|.*_v[xyz]"), "N"),
@@ -32,7 +33,9 @@ def _qualisys(above: Above) -> Head | None:
     points = "3D" in entries.get("DATA_INCLUDED", []) or "MARKER_NAMES" in entries
     names = None
     last = above.cells[-2]
-    if len(last) == above.width and not re.fullmatch(r"[A-Z_]{4,}", last[0]):
+    if len(last) == above.width and (
+        last[0].casefold() in _COUNTERS or not re.fullmatch(r"[A-Z_]{4,}", last[0])
+    ):
         names = last
     for columns in (triples(labels), labels):
         lead = _LEAD.get(above.width - len(columns))
