@@ -275,7 +275,7 @@ def outcome(path: Path, kind: str, code: int, said: bytes) -> str:
             else [channels_table(str(path), found)]
         )
         for table in tables:
-            load_columns(table, units="N", **({"rate": 100} if kind == ".npy" else {}))
+            load_columns(table, units="N", rate=100 if kind == ".npy" else None)
     except ValueError as error:
         return str(error)
     return ""

@@ -216,11 +216,10 @@ def read_tables(
         return [read_csv(_unpacked(file, instead), str(file), skip_rows)]
     if kind not in KINDS:
         looked_at(file, instead=instead)
+        export = f"; {EXPORTS[kind]}" if kind in EXPORTS else ""
         raise ValueError(
-            f"{file}: {kind} cannot be read here; {EXPORTS[kind]}"
-            if kind in EXPORTS
-            else f"{file}: a recording is one of {', '.join(KINDS)}, not"
-            f" {kind or 'one without ending'}"
+            f"{file}: a recording is one of {', '.join(KINDS)}, not"
+            f" {kind or 'one without ending'}{export}"
         )
     found = read_apart(file, kind, instead=instead)
     if isinstance(found, dict):

@@ -64,9 +64,16 @@ def _names(above: Above) -> Head:
             break
         rows = [*rows[:-2], before]
     names = rows[-1]
-    if not units and sum(map(_is_unit, names)) > width / 2 and seconds(names[0]):
-        units = names  # of a dynamometer, which names its columns by their units
+    units = units or _units_as_names(names)
     return Head(names, units, rates=rates) if rates else _with_rate(Head(names, units), above)
+
+
+def _units_as_names(names: list[str]) -> Sequence[str]:
+    """What a dynamometer calls its columns; the first alone if it can be nothing but a unit of
+    times, as "min" and "s" can."""
+    step = seconds(names[0])
+    several = step is not None and sum(map(_is_unit, names)) > len(names) / 2
+    return names if several else names[:1] if step is not None and step < 1 else ()
 
 
 def _with_rate(head: Head, above: Above) -> Head:

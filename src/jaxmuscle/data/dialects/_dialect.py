@@ -92,11 +92,6 @@ def frequency(cell: str) -> float | None:
     return found if 0 < found < math.inf else None
 
 
-def entries_of(above: Above) -> dict[str, list[str]]:
-    """The rows of a header by their first cell."""
-    return {row[0]: row[1:] for row in above.cells[:-1] if row}
-
-
 def triples(names: Iterable[str]) -> list[str]:
     """The columns of points."""
     return [f"{name} {axis}" for name in names for axis in "XYZ"]

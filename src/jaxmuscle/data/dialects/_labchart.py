@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from .._recording_channels import Channel
-from ._dialect import Above, Content, Dialect, Head, rate_of, texts
+from ._dialect import Above, Content, Dialect, Head, number, rate_of, texts
 
 
 def _head(above: Above) -> Head | None:
@@ -35,7 +35,9 @@ def _head(above: Above) -> Head | None:
 
 def _mat(content: Content) -> tuple[list[Channel], list[str]] | None:
     """`data` has all channels of all blocks behind one another; `datastart` and `dataend` (channels
-    by blocks, from 1; below that for none) say where each stands."""
+    by blocks, from 1; below that for none) say where each stands. Or a table for each block."""
+    if "data_block1" in content:
+        return _tables(content)
     if not {"data", "datastart", "dataend", "samplerate", "titles"} <= content.keys():
         return None
     data, titles = np.ravel(content["data"]), texts(content["titles"])
@@ -71,4 +73,26 @@ def _mat(content: Content) -> tuple[list[Channel], list[str]] | None:
     return (found, list(content)) if found else None
 
 
+def _tables(content: Content) -> tuple[list[Channel], list[str]]:
+    """`data_block1` and so on, with a row for each channel, and what else there is of the block."""
+    numbers = sorted(int(key[10:]) for key in content if re.fullmatch(r"data_block\d{1,6}", key))
+    found = []
+    for block in numbers:
+        own = {key: content.get(f"{key}_block{block}", "") for key in _OF_BLOCK}
+        rows = np.asarray(content[f"data_block{block}"])
+        rows = rows.reshape(1, -1) if rows.ndim < 2 else rows
+        ticks = np.ravel(own["ticktimes"]) if np.size(own["ticktimes"]) > 1 else np.zeros(2)
+        span = float(ticks[-1] - ticks[0])
+        rate = number(own["samplerate"]) or ((ticks.size - 1) / span if span > 0 else None)
+        titles, units = texts(own["titles"]), texts(own["units"])
+        for i, samples in enumerate(rows):
+            name = titles[i] if len(titles) == len(rows) and titles[i] else f"channel {i + 1}"
+            unit = units[i] if len(units) == len(rows) else ""
+            name = name if len(numbers) == 1 else f"{name}, block {block}"
+            alias = f"data_block{block}" + f":{i}" * (len(rows) > 1)
+            found.append(Channel(name, samples, rate, unit, alias))
+    return found, list(content)
+
+
+_OF_BLOCK = ("titles", "units", "samplerate", "ticktimes")
 LABCHART = Dialect(head=_head, mat=_mat)

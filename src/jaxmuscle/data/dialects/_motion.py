@@ -4,7 +4,7 @@ import functools
 import re
 
 from .._text_tables import cells_of
-from ._dialect import Above, Block, Dialect, Head, entries_of, frequency, triples
+from ._dialect import Above, Block, Dialect, Head, frequency, triples
 
 _LEAD = {0: [], 1: ["Sample"], 2: ["Frame", "Time"]}
 _COUNTERS = ("frame", "sample")
@@ -24,7 +24,8 @@ def _counters(names: list[str]) -> list[int]:
 def _qualisys(above: Above) -> Head | None:
     """`FREQUENCY`, `MARKER_NAMES` (three columns each) or `CHANNEL_NAMES`; a row of names may
     follow."""
-    entries = entries_of(above)
+    rows = [cells_of(body, "\t" if "\t" in body else above.delimiter) for _, body in above.rows]
+    entries = {row[0]: row[1:] for row in rows if row}
     if "FREQUENCY" not in entries or not any(key.startswith("NO_OF_") for key in entries):
         return None
     rate = frequency("".join(entries["FREQUENCY"][:1]))
@@ -32,7 +33,7 @@ def _qualisys(above: Above) -> Head | None:
     labels = [label for label in stated if label]
     points = "3D" in entries.get("DATA_INCLUDED", []) or "MARKER_NAMES" in entries
     names = None
-    last = above.cells[-2]
+    last = rows[-1]
     if len(last) == above.width and (
         last[0].casefold() in _COUNTERS or not re.fullmatch(r"[A-Z_]{4,}", last[0])
     ):
