@@ -299,6 +299,12 @@ TEXTS = {  # content, ending, column, unit
         None,
         None,
     ),
+    "rate in another language": (
+        "Fréquence d'échantillonnage : 100 Hz\nForce [N]\n" + rows(X),
+        "txt",
+        None,
+        "N",
+    ),
     "rate behind a sign": ("%Sample Rate = 100 Hz\nForce [N], EMG\n" + rows(X, Y), "txt", 0, "N"),
     "rate beside another frequency": (
         "Frequency: 50 Hz\nSampling frequency: 100 Hz\nForce [N]\n" + rows(X),
@@ -497,6 +503,14 @@ def column_of(lines):
     return cell
 
 
+def tracks(*arrays):
+    """A cell of arrays."""
+    cell = np.empty((1, len(arrays)), object)
+    for i, array in enumerate(arrays):
+        cell[0, i] = array
+    return cell
+
+
 def labchart(starts, ends, titles=("Force ", "EMG   "), **more):
     """`starts` and `ends` of channels by blocks."""
     return {
@@ -628,6 +642,15 @@ MATS = {  # variables, column, unit, tolerance
         "force",
         "% MVC",
     ),
+    "OTB, tracks": (
+        {
+            "Data": tracks(Y[:, None], X[:, None]),
+            "SamplingFrequency": np.array([[100.0, 100.0]]),
+            "Description": column_of(["EMG (1)[uV]", "Force[N]"]),
+        },
+        "Force",
+        "N",
+    ),
     "OTB, newtons": (
         OTB | {"Description": column_of(["EMG (1)[uV]", "Acquired Force[N]"])},
         "Acquired Force",
@@ -755,7 +778,7 @@ def save73(path, variables):
                 cells = group.create_dataset(name, value.shape[::-1], dtype=h5py.ref_dtype)
                 for i, each in enumerate(value.ravel()):
                     put(refs, f"{name}{i}", each)
-                    cells[0, i] = refs[f"{name}{i}"].ref
+                    cells[np.unravel_index(i, cells.shape)] = refs[f"{name}{i}"].ref
             elif isinstance(value, np.ndarray) and value.dtype.kind == "U":
                 codes = np.array(
                     [[ord(c) for c in line.ljust(value.dtype.itemsize // 4)] for line in value]
@@ -891,6 +914,12 @@ def test_sheets_of_one_layout_are_trials(tmp_path):
         np.testing.assert_array_equal(trials[1].whole, Y)
         assert "the sheets are trials, of Info, T1, T2, T3" in trials[0].notices
     assert len(load_recordings([path], sheet="T2")) == 1
+
+
+def test_a_table_of_results_is_no_signal(tmp_path):
+    results = pandas.DataFrame({"subject": [f"S{i}" for i in range(100)], "mvc": Y[:100]})
+    path = book(tmp_path / "a.xlsx", Results=results, Force=trial(X))
+    np.testing.assert_array_equal(load_recording(path).whole, X)
 
 
 def test_sheets_of_other_layouts_are_asked_for(tmp_path):

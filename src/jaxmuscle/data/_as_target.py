@@ -16,6 +16,7 @@ from ._recording_files import KINDS, ROWS, is_text
 from ._target import Target, load_target
 from ._text_tables import TEXT, beginning, cells_of, is_number
 from ._trials import Trials, load_recordings
+from .dialects._dialects import EXPORTS
 
 POINTS = 500  # more than a figure of a spectrum has
 
@@ -119,7 +120,7 @@ def is_recording(path: str | os.PathLike[str]) -> bool:
     path = Path(path).expanduser()
     kind = path.suffix.lower()
     if kind not in TEXT or not path.is_file():
-        return (kind in KINDS and kind != ".csv") or is_text(path)
+        return (kind in (*KINDS, *EXPORTS) and kind != ".csv") or is_text(path)
     rows, names, delimiter = beginning(path)
     if not rows:
         return kind != ".csv"

@@ -18,6 +18,7 @@ from ._recording import Recording
 from ._recording_choice import Reading, perturbed_of, recording_of, signals
 from ._recording_csv import read_csv
 from ._recording_table import Table, channels_table, find
+from ._recording_time import clock
 from ._text_tables import LOOK, TEXT, holds_text
 from .dialects._dialects import EXPORTS
 
@@ -273,7 +274,10 @@ def _sheets(
         with contextlib.suppress(ValueError):  # what is no table of numbers holds no signal
             if text.count(b"\n") >= ROWS and signals(table := read(name), None):
                 found[name] = table
-    layouts = {tuple(table.columns) for table in found.values()}
+    if len(_layouts(found)) > 1:  # a table of results has no times
+        timed = {name: t for name, t in found.items() if t.rates or clock(t) is not None}
+        found = timed or found
+    layouts = _layouts(found)
     if len(layouts) != 1:
         which = ", ".join(found) or "none"
         raise ValueError(
@@ -284,6 +288,10 @@ def _sheets(
     what = f"sheet {next(iter(found))} taken" if len(found) == 1 else "the sheets are trials"
     more = f", of {', '.join(names)}" if others else f": {', '.join(names)}"
     return [table._replace(notices=(f"{what}{more}", *table.notices)) for table in found.values()]
+
+
+def _layouts(tables: dict[str, Table]) -> set[tuple[str, ...]]:
+    return {tuple(table.columns) for table in tables.values()}
 
 
 def _asked(file: Path, names: list[str], sheet: str | int) -> str:

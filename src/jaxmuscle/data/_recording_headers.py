@@ -13,17 +13,19 @@ from .dialects._dialects import DIALECTS
 
 _RATE = re.compile(
     r"(?:(?:sampl(?:e|ing)|acquisition|scan|data|recording)[ _-]*)?(?:rate|frequency|freq)"
-    r"|samples[ _]*(?:per|/)[ _]*s(?:ec(?:ond)?)?|fs|fsamp|sfreq|abtastrate|abtastfrequenz"
+    r"|samples[ _]*(?:per|/)[ _]*s(?:ec(?:ond)?)?|fs|fsamp|sfreq|abtastrate|abtastfrequenz|messrate"
+    r"|fréquence d.échantillonnage|frecuencia de muestreo|frequenza di campionamento"
 )
 _STEP = re.compile(
     r"(?:(?:sampl(?:e|ing)|scan|time)[ _-]*)?(?:interval|period)|(?:sampl(?:e|ing)|time)[ _-]*step"
+    r"|sampl(?:e|ing)[ _-]*time"
     r"|dt|delta[ _]?t|abtastintervall"
 )
 _HERTZ = {
     1.0: ("", "hz", "s/s", "sps", "1/s", "samples/s", "samples/sec", "samples per second"),
     1e3: ("khz", "ks/s"),
 }
-_SHORT = ("fs", "fsamp", "sfreq", "abtastrate", "abtastfrequenz")
+_SURE = re.compile(r"sampl|^fs|^sfreq|abtast|chant|muestreo|campion")  # of no stimulus, say
 _UNITLIKE = re.compile(r"[^\W\d_]{1,3}|[%°µ\[(].*|.*[/^²·*].*")
 
 
@@ -119,9 +121,9 @@ def _stated_rate(above: Above) -> tuple[float | None, str]:
         name, _, unit = key.strip(' "').partition("[" if "[" in key else "(")
         if value and is_number(value[1], None):
             unit = value[2].strip(' ";,\t') or unit.strip(" )]")
-            name = name.strip().casefold()
+            name = name.strip(" .").casefold()
             if rate := _rate(name, value[1], unit.casefold()):
-                found["sampl" in name or name in _SHORT][rate] = " ".join(line.split())
+                found[_SURE.search(name) is not None][rate] = " ".join(line.split())
     sure = found[True] or found[False]
     return next(iter(sure.items())) if len(sure) == 1 else (None, "")
 

@@ -15,7 +15,8 @@ def _mat(content: Content) -> tuple[list[Channel], list[str]] | None:
     %(MVC)]`."""
     if not {"Data", "Description", "SamplingFrequency"} <= content.keys():
         return None
-    rate, labels = number(content["SamplingFrequency"]), texts(content["Description"])
+    rate = number(np.unique(np.ravel(content["SamplingFrequency"])))  # there may be one for each
+    labels = texts(content["Description"])
     parts = content["Data"]
     parts = [np.asarray(part) for part in (parts if isinstance(parts, list) else [parts])]
     parts = list(parts[0]) if parts[0].dtype == object else parts
