@@ -17,6 +17,7 @@ from jaxmuscle.data._recording_choice import signals
 from jaxmuscle.data._recording_files import load_columns, load_recording, read_table
 from jaxmuscle.data._recording_table import channels_table
 from jaxmuscle.data._trials import load_recordings
+from jaxmuscle.data._two_channels import perturbed_recordings
 
 N, RATE = 120, 100
 RNG = np.random.default_rng(7)
@@ -476,6 +477,12 @@ def test_a_rate_with_a_comma_for_thousands(tmp_path):
     assert "rate 2048 Hz, as the header says: Sampling rate: 2,048 Hz" in recording.notices
 
 
+def test_frequencies_as_names_are_no_rates(tmp_path):
+    head = "Stimulation,,\n20 Hz,50 Hz,100 Hz\n"
+    table = read_table(write(tmp_path, head + rows(X, Y, Z), "a.csv"))
+    assert list(table.columns) == ["20 Hz", "50 Hz", "100 Hz"] and not table.rates
+
+
 @pytest.mark.parametrize(
     "line",
     [
@@ -751,7 +758,7 @@ def test_blocks_of_labchart_are_trials(tmp_path):
     path = tmp_path / "trial.mat"
     scipy.io.savemat(path, labchart([[1, 361]], [[120, 480]], ["Force"], unittextmap=[[1.0, 1.0]]))
     with pytest.raises(
-        ValueError, match=r"choose one with `column`: Force, block 1, Force, block 2"
+        ValueError, match="choose one with `column`: 'Force, block 1', 'Force, block 2'"
     ):
         load_recording(path)
     first, second = load_recordings(path)
@@ -920,6 +927,11 @@ def test_a_table_of_results_is_no_signal(tmp_path):
     results = pandas.DataFrame({"subject": [f"S{i}" for i in range(100)], "mvc": Y[:100]})
     path = book(tmp_path / "a.xlsx", Results=results, Force=trial(X))
     np.testing.assert_array_equal(load_recording(path).whole, X)
+
+
+def test_a_workbook_of_trials_is_no_perturbation(tmp_path):
+    path = book(tmp_path / "a.xlsx", T1=trial(X), T2=trial(Y))
+    assert perturbed_recordings(path, files=True) == ()
 
 
 def test_sheets_of_other_layouts_are_asked_for(tmp_path):

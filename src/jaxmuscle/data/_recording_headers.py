@@ -58,7 +58,8 @@ def _names(above: Above) -> Head:
     units: Sequence[str] = ()
     rates: Sequence[float | None] = ()
     while len(rows) > 1 and len(before := _joined(rows[-2], width)) == width:
-        if not rates and (found := rates_in(rows[-1])):
+        found = rates_in(rows[-1]) or []
+        if not rates and found and all(n for n, rate in zip(before, found, strict=True) if rate):
             rates = found
         elif not units and _are_units(rows[-1], before):
             units = [cell.strip("[]() ") for cell in rows[-1]]
@@ -67,7 +68,12 @@ def _names(above: Above) -> Head:
         rows = [*rows[:-2], before]
     names = rows[-1]
     units = units or _units_as_names(names)
-    return Head(names, units, rates=rates) if rates else _with_rate(Head(names, units), above)
+    said = ("rates as the row below the names says",)
+    return (
+        Head(names, units, rates=rates, notices=said)
+        if rates
+        else _with_rate(Head(names, units), above)
+    )
 
 
 def _units_as_names(names: list[str]) -> Sequence[str]:

@@ -165,6 +165,7 @@ def listed(names: Iterable[str]) -> str:
     for name in sorted(names, key=lambda name: _COORDINATE.search(name) is not None):
         stem, _, index = name.rpartition(":")
         groups.setdefault(stem if stem and index.isdigit() else name, []).append(name)
+    groups = {stem: [repr(n) if ", " in n else n for n in group] for stem, group in groups.items()}
     short = [
         group[0] if len(group) == 1 else f"{group[0]} to {group[-1]}" for group in groups.values()
     ]
