@@ -191,7 +191,15 @@ def read_table(
 def read_tables(
     path: str | os.PathLike[str] | Table, skip_rows: int = 0, sheet: str | int | None = None
 ) -> list[Table]:
-    """What `read_table` gives; or of a workbook the sheets of trials, if there are several."""
+    """What `read_table` gives of a file; of a workbook of trials one table for each.
+
+        tables = jaxmuscle.data.read_tables("trials.xlsx")
+        trials = jaxmuscle.load_recordings(tables)
+
+    **Arguments:** `path`, `skip_rows`, `sheet` as in `read_table`.
+
+    **Raises:** as `read_table`; but not for several sheets of the same columns.
+    """
     if isinstance(path, Table):
         return [path]
     require(isinstance(path, str | os.PathLike), "path", path, "give the path of a recording")
