@@ -16,6 +16,7 @@ from jaxmuscle.data._recording_channels import Channel
 from jaxmuscle.data._recording_choice import signals
 from jaxmuscle.data._recording_files import load_columns, load_recording, read_table
 from jaxmuscle.data._recording_table import channels_table
+from jaxmuscle.data._study_table import read_study
 from jaxmuscle.data._trials import load_recordings
 from jaxmuscle.data._two_channels import perturbed_recordings
 
@@ -697,6 +698,11 @@ MATS = {  # variables, column, unit, tolerance
         "force",
         None,
     ),
+    "signal of reference": (
+        {"SIG": tracks(Y), "IPTs": np.stack([Y, Z]), "REF_SIGNAL": X, "FSAMP": 100.0},
+        None,
+        None,
+    ),
     "labels beside": (
         {
             "data": np.stack([Y, X], axis=1),
@@ -932,6 +938,14 @@ def test_a_table_of_results_is_no_signal(tmp_path):
 def test_a_workbook_of_trials_is_no_perturbation(tmp_path):
     path = book(tmp_path / "a.xlsx", T1=trial(X), T2=trial(Y))
     assert perturbed_recordings(path, files=True) == ()
+
+
+def test_sheets_of_a_study(tmp_path):
+    path = book(tmp_path / "a.xlsx", T1=trial(X), T2=trial(Y))
+    write(tmp_path, f"file,person,sheet\n{path.name},anna,T1\n{path.name},berta,1\n", "study.csv")
+    first, second = read_study(tmp_path / "study.csv").rows
+    np.testing.assert_array_equal(load_recording(first.file, **first.reading).whole, X)
+    np.testing.assert_array_equal(load_recording(second.file, **second.reading).whole, Y)
 
 
 def test_sheets_of_other_layouts_are_asked_for(tmp_path):

@@ -17,8 +17,8 @@ from ._recording_table import AXES, Table, bare, find, listed, points, triple, v
 from ._recording_time import clock, sampling
 from ._units import UNITS, known_unit, quantity_of, scale_to_si
 
-# what a column of force is called
-FORCE = re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?")
+# what a column of force is called, by decomposition programs the signal of reference
+FORCE = re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?|ref_?signal")
 
 _NUMBER = re.compile(r" \d+$")  # of columns of one name
 
