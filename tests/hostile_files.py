@@ -139,8 +139,27 @@ def write_tar(path: Path) -> None:
         archive.addfile(entry, io.BytesIO(text))
 
 
+def write_program_mat(path: Path) -> None:
+    """What Spike2, LabChart, AcqKnowledge and OTBioLab write, each in its part of the bytes."""
+    import scipy.io
+
+    force, cell = signals()["force"], np.empty((1, 1), object)
+    cell[0, 0] = "Force[N]"
+    channel = {"title": "Force", "interval": 0.01, "units": "N", "length": ROWS, "values": force}
+    labchart = {"data": force, "datastart": 1, "dataend": ROWS, "titles": "F", "samplerate": 100}
+    acq = {"data": force, "labels": "F", "units": "N", "isi": 10, "isi_units": "ms"}
+    otb = {"Data": force, "Description": cell, "SamplingFrequency": 100.0}
+    program = path.name.partition(".")[2].partition(".")[0]
+    each = {"spike2": {"ch1": channel}, "labchart": labchart, "acq": acq, "otb": otb}
+    scipy.io.savemat(path, each[program])
+
+
 WRITERS: dict[str, Callable[[Path], None]] = {
     "mat": write_mat,
+    "spike2.mat": write_program_mat,
+    "labchart.mat": write_program_mat,
+    "acq.mat": write_program_mat,
+    "otb.mat": write_program_mat,
     "packed.mat": write_packed_mat,
     "v73.mat": write_mat73,
     "npz": write_npz,
@@ -250,12 +269,13 @@ def outcome(path: Path, kind: str, code: int, said: bytes) -> str:
         if kind == ".tar":
             read_project(found.decode("utf-8", errors="replace"), str(path), None)
             return ""
-        table = (
-            read_csv(found, str(path))
-            if isinstance(found, bytes)
-            else channels_table(str(path), found)
+        tables = (
+            [read_csv(sheet, str(path)) for sheet in found.values()]
+            if isinstance(found, dict)
+            else [channels_table(str(path), found)]
         )
-        load_columns(table, units="N", **({"rate": 100} if kind == ".npy" else {}))
+        for table in tables:
+            load_columns(table, units="N", rate=100 if kind == ".npy" else None)
     except ValueError as error:
         return str(error)
     return ""
@@ -291,6 +311,35 @@ _TEXTS = {
         "#BEGINCHANNELHEADER\n200,Kraft\n202,N\n210,EXPLICIT\n211,values.bin\n213,CHANNEL\n214,REAL64\n220,120\n221,1\n"
         "#ENDCHANNELHEADER\n"
     ),
+    "vicon": (
+        "Model Outputs\n50\n,,a\nFrame,Sub Frame,X\n,,deg\n1,0,2\n2,0,3\n\nDevices\n100\n,,Plate\n"
+        "Frame,Sub Frame,Fz\n,,N\n" + _rows(range(ROWS), [0] * ROWS, X, sign=",")
+    ),
+    "qualisys": (
+        "NO_OF_FRAMES\t120\nFREQUENCY\t100\nDATA_INCLUDED\t3D\nMARKER_NAMES\ta\n" + _rows(X, Y, X)
+    ),
+    "trc": (
+        "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tUnits\n100\t100\tmm\n"
+        "Frame#\tTime\ta\t\t\n\t\tX1\tY1\tZ1\n\n" + _rows(range(ROWS), TIME, X, Y, X)
+    ),
+    "labview": (
+        "LabVIEW Measurement\t\nSeparator\tTab\n***End_of_Header***\t\n\t\n"
+        + 2
+        * (
+            "Channels\t1\t\nY_Unit_Label\tN\nDelta_X\t0.002\n***End_of_Header***\t\t\n"
+            "X_Value\tForce\tComment\n" + _rows([""] * ROWS, X)
+        )
+    ),
+    "opensignals": (
+        '# OpenSignals Text File Format\n# {"a": {"sensor": ["RAW"], "column": ["nSeq", "A1"],'
+        ' "sampling rate": 100}}\n# EndOfHeader\n' + _rows([1, 2] * (ROWS // 2), X, [""] * ROWS)
+    ),
+    "trigno": (
+        "Application:,Trigno Discover\nSensor (1),,Sensor (2),\n"
+        "EMG 1 Time Series (s),EMG 1 (mV),EMG 1 Time Series (s),EMG 1 (mV)\n,500 Hz,,500 Hz\n"
+        + _rows(TIME, X, TIME, Y, sign=",")
+    ),
+    "words": "Sampling rate: 500 Hz\nforce [N]\tforce [N]\n" + _rows(X, Y),
     "clock": "clock;F\n" + _rows([f"10:00:{t:06.3f}" for t in TIME], X, sign=";"),
 }
 TEXTS = {name: text.encode() for name, text in _TEXTS.items()}

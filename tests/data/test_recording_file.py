@@ -375,7 +375,11 @@ BAD = {
         {},
         "line 2: 3 of 2 columns found; decimal commas need",
     ),
-    "column twice": ("force,force\n1,2\n", {}, "column 'force' appears twice"),
+    "column twice": (
+        "force,force\n1,2\n3,4\n",
+        {"rate": 100},
+        "choose one with `column`: force, force 2",
+    ),
     "no rate": (text(X), {}, "does not state its rate (no time column found); give `rate` in Hz"),
     "rate zero": (text(X), {"rate": 0}, "rate=0: give samples per second [Hz], above 0"),
     "rate low": (

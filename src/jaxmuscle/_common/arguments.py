@@ -12,6 +12,12 @@ import numpy as np
 EXTRAS = {"posterior": ("blackjax", "arviz_stats")}
 
 
+def require(holds: bool | np.bool, name: str, value: object, remedy: str) -> None:
+    """Raises the `ValueError` of a wrong argument: its name, its value, and what would be right."""
+    if not holds:
+        raise ValueError(f"{name}={value!r}: {remedy}")
+
+
 def is_real(value: Any) -> bool:
     """Whether a value is a number, a finite one: no switch, no text, no array of several."""
     if isinstance(value, bool | np.bool_ | str | bytes) or np.ndim(value):

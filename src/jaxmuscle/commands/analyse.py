@@ -31,7 +31,15 @@ from .options import (
     Window,
     formats_of,
 )
-from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed, unused, windows_of
+from .recordings import (
+    perturbed,
+    read_perturbed,
+    read_trials,
+    reads_perturbed,
+    tables_of,
+    unused,
+    windows_of,
+)
 
 if TYPE_CHECKING:
     from jaxmuscle import PerturbedRecording, Trials
@@ -128,12 +136,14 @@ def analyse(
                     "--save-target and --mvc belong to spectra, and this recording has a moved"
                     " insertion: leave them out"
                 )
-            if len(paths) > 1:
+            tables = tables_of(paths, reading)
+            if len(tables) > 1:
+                what = "files are given" if len(paths) > 1 else "sheets hold a signal"
                 raise ValueError(
-                    f"{len(paths)} files are given; with force and displacement give one at a time"
+                    f"{len(tables)} {what}; with force and displacement give one at a time"
                 )
             return _write_perturbed(
-                read_perturbed(paths, reading, windows_of(window, len(paths)))[0],
+                read_perturbed(tables, reading, windows_of(window, 1))[0],
                 str(spectrum),
                 output,
                 formats_of(formats),

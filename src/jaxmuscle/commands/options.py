@@ -199,6 +199,16 @@ _Time = Annotated[
         metavar="NAME", help="Column that holds the time, if the program does not find it."
     ),
 ]
+_Sheet = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help=(
+            "Sheet of a workbook: its name, or its number from 0. By default the one that holds a"
+            " signal; several alike are trials."
+        ),
+    ),
+]
 _Arm = Annotated[
     float | None,
     typer.Option(
@@ -237,6 +247,7 @@ READING: dict[str, tuple[Any, Any]] = {
         ],
         0,
     ),
+    "sheet": (_Sheet, None),
     "max_gap": (
         Annotated[
             float,

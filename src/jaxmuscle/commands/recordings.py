@@ -83,11 +83,11 @@ def read_recordings(
 ) -> "list[PerturbedRecording] | Trials":
     """The recordings of one condition: of force and displacement, by the options, else by the task
     and the columns."""
+    tables = tables_of(paths, reading)
     if perturbed(reading):
-        return read_perturbed(paths, reading, windows_of(window, len(paths)))
+        return read_perturbed(tables, reading, windows_of(window, len(tables)))
     if task not in (None, "prescribed-length") or reading["column"] is not None:
-        return read_trials(paths, reading, window)
-    tables = [table_of(path, reading) for path in paths]
+        return read_trials(tables, reading, window)
     found = [channels(table, reading) for table in tables]
     both = all(found)
     if task is None and both and _held(tables, found):
@@ -136,20 +136,20 @@ def read_with_holds(
 ) -> "tuple[list[PerturbedRecording], Trials]":
     """Records of a moved insertion and those of the same person with the insertion held, which have
     the force alone."""
-    windows = windows_of(window, len(paths) + len(holds))
-    tables = [table_of(path, reading) for path in paths]
-    for path, table in zip(paths, tables, strict=True):
+    tables, held_tables = tables_of(paths, reading), tables_of(holds, reading)
+    windows = windows_of(window, len(tables) + len(held_tables))
+    for table in tables:
         if not perturbed(reading) and not channels(table, reading):
             raise ValueError(
-                f"{path}: no displacement was found beside the force. Name the columns with"
+                f"{table.file}: no displacement was found beside the force. Name the columns with"
                 " --force-column and --displacement. Or are the files swapped? Moved records come"
                 " first, --hold takes the holds"
             )
-    moved = read_perturbed(tables, reading, windows[: len(paths)])
+    moved = read_perturbed(tables, reading, windows[: len(tables)])
     held = jm.Trials(
         [
-            _hold(path, reading, edges)
-            for path, edges in zip(holds, windows[len(paths) :], strict=True)
+            _hold(table, reading, edges)
+            for table, edges in zip(held_tables, windows[len(tables) :], strict=True)
         ]
     )
     for recording in held:
@@ -170,15 +170,15 @@ def read_with_holds(
     return moved, held
 
 
-def _hold(path: str, reading: dict[str, Any], edges: Any) -> Any:
+def _hold(table: "Table", reading: dict[str, Any], edges: Any) -> Any:
     """The force in a file, in the column that it has in the moved records, if there is one."""
-    table, named = table_of(path, reading), reading["force_column"]
+    named = reading["force_column"]
     if both := channels(table, reading | {"force_column": None, "displacement": None}):
         moves = jm.data.movement(table, both["displacement"])
         if not moves.rests:
             raise ValueError(
-                f"--hold {path}: its column {both['displacement']} moves by {moves}, and in a hold"
-                " the insertion rests. Name this file among the moved records, before --hold"
+                f"--hold {table.file}: its column {both['displacement']} moves by {moves}, and in a"
+                " hold the insertion rests. Name this file among the moved records, before --hold"
             )
     options = {name: reading[name] for name in READING} | {"reference": None}
     options["column"] = named if named in table.columns else None
@@ -203,8 +203,7 @@ def read_perturbed(
         if name not in ("force_column", "displacement")
     }
     named = {"force": reading["force_column"], "displacement": reading["displacement"]}
-    tables = [table_of(path, reading) for path in paths]
-    each = zip(tables, windows, strict=True)
+    each = zip(tables_of(paths, reading), windows, strict=True)
     return [
         read(table, options | (channels(table, reading) or named), edges) for table, edges in each
     ]
@@ -215,14 +214,14 @@ def read_trials(
 ) -> "Trials":
     """The recordings of one condition, each with its steady part: several files, or all columns of
     one (`--column all`)."""
-    if len(paths) > 1 or reading["column"] != "all":
-        options, each = {name: reading[name] for name in READING}, windows_of(window, len(paths))
-        return jm.Trials(
-            [read(table_of(path, reading), options, e) for path, e in zip(paths, each, strict=True)]
-        )
+    tables = tables_of(paths, reading)
+    options = {name: reading[name] for name in READING}
+    if len(tables) > 1 or reading["column"] != "all":
+        each = zip(tables, windows_of(window, len(tables)), strict=True)
+        return jm.Trials([read(table, options, edges) for table, edges in each])
     (edges,) = windows_of(window, 1)
-    options = {name: reading[name] for name in READING if name not in ("column", "reference")}
-    trials = jm.load_recordings(table_of(paths[0], reading), **options)
+    del options["column"], options["reference"]
+    trials = jm.load_recordings(tables[0], **options)
     return trials if edges == "all" else trials.steady(edges)
 
 
@@ -232,9 +231,10 @@ def read(table: "Table", reading: dict[str, Any], edges: Any) -> Any:
     return recording if edges == "all" else recording.steady(edges)
 
 
-def table_of(path: "str | Table", reading: dict[str, Any]) -> "Table":
-    """The columns of a file, which is read here alone."""
-    return jm.data.read_table(path, reading["skip_rows"])
+def tables_of(paths: "Sequence[str | Table]", reading: dict[str, Any]) -> "list[Table]":
+    """The columns of files, which are read here alone; of a workbook those of every trial."""
+    how = reading["skip_rows"], reading["sheet"]
+    return [table for path in paths for table in jm.data.read_tables(path, *how)]
 
 
 def require_files(names: Sequence[str]) -> None:

@@ -10,6 +10,7 @@ from ._perturbed import PerturbedRecording as PerturbedRecording
 from ._recording import Recording as Recording
 from ._recording_files import load_recording as load_recording
 from ._recording_files import read_table as read_table
+from ._recording_files import read_tables as read_tables
 from ._recording_quality import RecordingSummary as RecordingSummary
 from ._recording_table import Table as Table
 from ._steadiness import Steadiness as Steadiness

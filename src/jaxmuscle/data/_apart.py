@@ -43,12 +43,12 @@ ALONE = {
 
 
 def read_apart(path: Path, kind: str, error: type[ValueError] = ValueError, **words: str) -> Any:
-    """The channels of the file at `path`, or the text that it is made of, read as `kind` in a
-    process of its own.
+    """The channels of the file at `path`, or the text or sheets that it is made of, read as `kind`
+    in a process of its own.
 
     **Arguments:** `words`, as in `looked_at`.
 
-    **Returns:** a list of `Channel`s, or bytes.
+    **Returns:** a list of `Channel`s, bytes, or the bytes of every sheet.
 
     **Raises:** `error` naming the file, also where that process crashes, needs too much memory or
     time; `ImportError` that says what to install.
@@ -138,7 +138,7 @@ def _reading(
         process.stdout.close()
 
 
-def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes:
+def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes | dict[str, bytes]:
     """What the process hands over; not trusted, since the file may have taken it over.
 
     **Raises:** `EOFError` where it ends before it has said all; `ValueError` with the words for
@@ -150,12 +150,13 @@ def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes:
     try:
         head = json.loads(line)
         large, missing, wrong = head.get("large"), head.get("missing"), head.get("wrong")
-        size = head.get("text")
-        if size is not None and (not isinstance(size, int) or size < 0):
+        single = {"": head["text"]} if "text" in head else {}
+        sizes = single or dict(head.get("sheets", ()))
+        if not all(isinstance(size, int) and size >= 0 for size in sizes.values()):
             raise TypeError
         described = [_described(*entry) for entry in head.get("channels", ())]
-        total = (size or 0) + sum(
-            np.dtype(kind).itemsize * count for _, kind, count, _, _ in described
+        total = sum(sizes.values()) + sum(
+            np.dtype(kind).itemsize * count for _, kind, count, *_ in described
         )
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         raise ValueError("it is damaged, and the answer of its reader makes no sense") from None
@@ -168,19 +169,23 @@ def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes:
             f"it holds more than {allowed / 2**30:.3g} GiB, or says so because it is"
             f" damaged{BEYOND}"
         )
-    if size is not None:
-        return _filled(stream, np.empty(size, np.uint8)).tobytes()
+    texts = {
+        printable(str(name)): _filled(stream, np.empty(size, np.uint8)).tobytes()
+        for name, size in sizes.items()
+    }
+    if texts:
+        return texts[""] if single else texts
     if not described:
         raise ValueError("holds no channels with numbers")
     return [
-        Channel(name, _filled(stream, np.empty(count, kind)), rate, unit)
-        for name, kind, count, rate, unit in described
+        Channel(name, _filled(stream, np.empty(count, kind)), rate, unit, alias)
+        for name, kind, count, rate, unit, alias in described
     ]
 
 
 def _described(
-    name: Any, kind: Any, count: Any, rate: Any, unit: Any
-) -> tuple[str, str, int, float | None, str]:
+    name: Any, kind: Any, count: Any, rate: Any, unit: Any, alias: Any = ""
+) -> tuple[str, str, int, float | None, str, str]:
     if kind not in TYPES or not isinstance(count, int) or count < 0:
         raise TypeError
     stated = math.nan if rate is None else float(rate)
@@ -190,6 +195,7 @@ def _described(
         count,
         stated if 0 < stated < math.inf else None,
         printable(str(unit)),
+        printable(str(alias)),
     )
 
 

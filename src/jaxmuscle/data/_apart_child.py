@@ -43,8 +43,9 @@ def read_tar(path: str, most: int) -> bytes:
     raise ValueError("holds no wpd.json, so it is not a WebPlotDigitizer project")
 
 
-READERS: dict[str, Callable[[str, int], list[Channel] | bytes]] = {
+READERS: dict[str, Callable[[str, int], list[Channel] | bytes | dict[str, bytes]]] = {
     ".xlsx": read_xlsx,
+    ".xlsm": read_xlsx,
     ".mat": read_mat,
     ".npy": read_npy,
     ".npz": read_npz,
@@ -91,7 +92,7 @@ def limit(most: int, seconds: int) -> None:
 
 
 def answer(request: dict[str, Any], out: io.BufferedIOBase) -> None:
-    """One line of JSON that says what follows, or what is wrong; then the bytes of the text, or of
+    """One line of JSON that says what follows, or what is wrong; then the bytes of the texts, or of
     all samples."""
     head: dict[str, Any]
     parts: Iterator[Any] = iter(())
@@ -99,6 +100,13 @@ def answer(request: dict[str, Any], out: io.BufferedIOBase) -> None:
         found = READERS[request["kind"]](request["path"], request["most"])
         if isinstance(found, bytes):
             head, parts, size = {"text": len(found)}, iter((found,)), len(found)
+        elif isinstance(found, dict):
+            sizes = {name: len(text) for name, text in found.items()}
+            head, parts, size = (
+                {"sheets": [*sizes.items()]},
+                iter(found.values()),
+                sum(sizes.values()),
+            )
         else:
             channels = [
                 channel._replace(samples=_plain(channel.samples)) for channel in distinct(found)
@@ -129,7 +137,8 @@ def _plain(samples: Any) -> np.ndarray:
 
 def _described(channel: Channel) -> list[Any]:
     rate = None if channel.rate is None else float(channel.rate)
-    return [channel.name, channel.samples.dtype.str, channel.samples.size, rate, channel.unit]
+    samples = channel.samples
+    return [channel.name, samples.dtype.str, samples.size, rate, channel.unit, channel.alias]
 
 
 def _bytes(channel: Channel) -> memoryview:

@@ -12,14 +12,14 @@ from ._frequency_response import FrequencyResponse
 from ._frequency_response_files import is_frequency_response, is_response, load_frequency_response
 from ._perturbed import PerturbedRecording
 from ._recording import Recording
-from ._recording_files import KINDS
+from ._recording_files import KINDS, ROWS, is_text
 from ._target import Target, load_target
 from ._target_csv import NAMES, column_role
 from ._text_tables import TEXT, beginning, cells_of, is_number
 from ._trials import Trials, load_recordings
+from .dialects._dialects import EXPORTS
 
-# Rows that the shortest recording has, and more than a figure of a spectrum does.
-ROWS, POINTS = 90, 500
+POINTS = 500  # more than a figure of a spectrum has
 
 
 def as_target(
@@ -121,7 +121,7 @@ def is_recording(path: str | os.PathLike[str]) -> bool:
     path = Path(path).expanduser()
     kind = path.suffix.lower()
     if kind not in TEXT or not path.is_file():
-        return kind in KINDS and kind != ".csv"
+        return (kind in (*KINDS, *EXPORTS) and kind != ".csv") or is_text(path)
     rows, names, delimiter = beginning(path)
     if not rows:
         return kind != ".csv"

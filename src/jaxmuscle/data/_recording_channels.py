@@ -1,6 +1,8 @@
 """Channels of a file as the readers hand them over. Light to import: the process that reads needs
 nothing else."""
 
+import itertools
+import re
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
@@ -9,6 +11,8 @@ import numpy as np
 # in which samples are handed over
 TYPES = ("|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f4", "<f8")
 
+_UNIT = re.compile(r"\s*[\[(][^\[\]()]*[\])]\s*$")
+
 
 class TooLarge(ValueError):
     """A file holds, or says that it holds, more than may be read."""
@@ -16,12 +20,13 @@ class TooLarge(ValueError):
 
 class Channel(NamedTuple):
     """A channel: its name, samples (numbers, one dimension), rate [Hz] and unit, as far as the file
-    states them."""
+    states them; and what it is called where a label is not looked at."""
 
     name: str
     samples: np.ndarray
     rate: float | None = None
     unit: str = ""
+    alias: str = ""
 
 
 def distinct(channels: Iterable[Channel]) -> Iterator[Channel]:
@@ -30,9 +35,20 @@ def distinct(channels: Iterable[Channel]) -> Iterator[Channel]:
     known: set[str] = set()
     for number, channel in enumerate(channels):
         name = str(channel.name).strip() or f"channel {number}"
-        name = name if name not in known else f"{name} {number}"
+        while name in known:
+            name = f"{name} {number}"
         known.add(name)
         yield channel._replace(name=name, unit=str(channel.unit).strip())
+
+
+def numbered(names: Iterable[str]) -> list[str]:
+    """Names of their own: `NAME 2` where NAME is there already, `NAME 2 [N]` where NAME [N] is."""
+    found: dict[str, None] = {}
+    for name in names:
+        stem, unit = _UNIT.split(name, 1)[0], "".join(_UNIT.findall(name)[:1])
+        others = (f"{stem} {number}{unit}" for number in itertools.count(2))
+        found[next(other for other in itertools.chain([name], others) if other not in found)] = None
+    return list(found)
 
 
 def numbers(column: Any) -> np.ndarray:

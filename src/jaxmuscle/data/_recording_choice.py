@@ -17,8 +17,10 @@ from ._recording_table import AXES, Table, bare, find, listed, points, triple, v
 from ._recording_time import clock, sampling
 from ._units import UNITS, known_unit, quantity_of, scale_to_si
 
-# what a column of force is called
-FORCE = re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?")
+# what a column of force is called, by decomposition programs the signal of reference
+FORCE = re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?|ref_?signal")
+
+_NUMBER = re.compile(r" \d+$")  # of columns of one name
 
 
 class _Choice(NamedTuple):
@@ -54,17 +56,17 @@ def recording_of(
     )
     times = clock(table, time)
     chosen = _chosen(table, column, axis, reference, None if times is None else times.name)
+    times = clock(table, time, chosen.columns[0]) if table.clocks else times
     signal = values(table, chosen.columns)
     if reference is not None:
         signal = signal - values(table, _reference(table, reference, axis, signal.shape))
     found, notices = sampling(table, chosen.columns[0], times, signal.shape[0], rate)
-    notices = [*([chosen.told] if chosen.told else []), *notices]
+    notices = [*table.notices, *([chosen.told] if chosen.told else []), *notices]
     unit = _unit(table, chosen, units, axis, notices)
     if lever_arm is not None:
         signal, unit = _as_force(table, chosen.name, signal, unit, lever_arm, notices)
-    file = Path(table.file)
     words = [
-        file.name,
+        Path(table.file).name,
         f"column {chosen.name}" if axis is None else f"point {chosen.name}, axis {axis}",
     ]
     words += [f"minus {reference}"] * (reference is not None) + [f"{found:.6g} Hz"]
@@ -75,7 +77,7 @@ def recording_of(
             samples,
             found,
             unit=unit,
-            name=name or printable(file.stem),
+            name=name or table.name,
             source=printable(", ".join(words)),
             start=start,
             notices=(*notices, *closed),
@@ -94,8 +96,8 @@ def perturbed_of(
 ) -> Any:
     """What `make` makes of the columns of force and displacement, by name of the role; gaps are
     closed in both alike."""
-    times = clock(table, reading.time)
     names = {role: find(table, column, role) for role, column in columns.items()}
+    times = clock(table, reading.time, names["force"])
     for role, name in names.items():
         if times is not None and name == times.name:
             others = listed(_others(table, name))
@@ -119,8 +121,8 @@ def perturbed_of(
             " `displacement_units`, as displacement_units='mm'; or, if nothing moved the"
             " insertion, the force alone, as `column`"
         )
-    file = Path(table.file)
-    source = f"{file.name}, columns {force} and {displacement}, {found:.6g} Hz"
+    notices = [*table.notices, *notices]
+    source = f"{Path(table.file).name}, columns {force} and {displacement}, {found:.6g} Hz"
     try:
         whole, start, closed = filled(signal, found, float(reading.max_gap))
         return make(
@@ -128,7 +130,7 @@ def perturbed_of(
             found,
             units=units,
             displacement_units=moved,
-            name=printable(file.stem),
+            name=table.name,
             start=start,
             source=printable(source),
             notices=(*notices, *closed),
@@ -188,7 +190,7 @@ def _chosen(
         forces = (
             forces
             if len(forces) == 1
-            else [name for name in forces or others if FORCE.fullmatch(bare(name))]
+            else [name for name in forces or others if FORCE.fullmatch(_NUMBER.sub("", bare(name)))]
         )
         if len(forces) == 1:
             return _Choice(
@@ -206,7 +208,8 @@ def _chosen(
 
 
 def _others(table: Table, time: str | None) -> list[str]:
-    return [name for name in table.columns if name != time and name not in table.words]
+    none = {time, *table.words, *table.clocks.values()}
+    return [name for name in table.columns if name not in none]
 
 
 def _moved(table: Table, others: list[str], force: str) -> str:

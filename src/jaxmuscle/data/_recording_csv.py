@@ -3,37 +3,59 @@ kinds."""
 
 import functools
 import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from ._recording_body import Body, is_value
-from ._recording_headers import Head, diadem, head_of, spike2
-from ._recording_table import Table, units_of
+from ._recording_channels import numbered
+from ._recording_headers import head_of
+from ._recording_table import Table, listed, merged, units_of
 from ._recording_time import clock
 from ._text_tables import SIGNS, Line, cells_of, lines_of
+from ._units import name_and_unit, seconds
+from .dialects._dialect import Above, Block, Head
+from .dialects._dialects import DIALECTS
 
 HEAD = 1 << 16  # bytes in which the first rows of numbers are expected
 WIDEST = 20_000  # columns
+NUMBERED = "columns of one name are numbered: "
+_TIME_OF = re.compile(r" *(?:time series|time|\[?x\]?) *")
 
 
 def read_csv(data: bytes, file: str, skip_rows: int = 0) -> Table:
     """The columns of a text file; `#` starts a comment.
 
     The delimiter is that of most lines: tab, semicolon, comma or blanks. Decimal commas are read
-    where it is not the comma. What stands above the first row of numbers is the header: names, a
-    row of units, or what LabChart, Spike2, AcqKnowledge and DIAdem write. The last comment before
+    where it is not the comma. What stands above the first row of numbers is the header: names,
+    rows of units and rates, or what the programs of `dialects` write. The last comment before
     the data is one as well if it has a name for each column and one of them is the time (as
     `numpy.savetxt` writes it).
 
     **Raises:** `ValueError` naming file and line.
     """
     data = _plain(data, file)
-    found = spike2(data, file) or diadem(data, file, read_csv)
-    if found is not None:
-        return found
+    for dialect in DIALECTS:
+        table = dialect.table and dialect.table(data, file, read_csv)
+        if table:
+            return table
+        blocks = dialect.blocks and dialect.blocks(data)
+        if blocks:
+            # "Frame#" is the name of a column
+            parts = [each._replace(data=each.data.replace(b"#", b"")) for each in blocks]
+            return merged(file, [_block(each, file, skip_rows) for each in parts])
+    return _block(Block(data, 0, head_of), file, skip_rows)
+
+
+def _block(block: Block, file: str, skip_rows: int) -> Table:
+    data, before = block.data, block.lines
+    skip_rows -= before
     notes = [line for line in lines_of(_text(data[:HEAD])) if line.number > skip_rows]
     data = re.sub(rb"[\t ]*#[^\n]*", b"", data) if b"#" in data else data
     lines = [line for line in _first_lines(data) if line.number > skip_rows]
-    rows = [(line.number, line.body) for line in lines if line.body.strip()]
+    rows = [(line.number + before, line.body) for line in lines if line.body.strip()]
     if not rows:
         raise ValueError(f"{file}: holds no data, only comments")
     delimiter = _delimiter([body for _, body in rows[len(rows) // 2 :]])
@@ -52,13 +74,17 @@ def read_csv(data: bytes, file: str, skip_rows: int = 0) -> Table:
     at = _start(cells, width, delimiter)
     if at is None:
         raise ValueError(f"{file}: holds a header (line {rows[0][0]}) but no data")
-    head = head_of(lines, rows[:at], cells[: at + 1], width, delimiter, data.count(b"\n"), file)
+    length = block.data.count(b"\n")
+    above = Above(
+        notes, rows[:at], cells[: at + 1], width, delimiter, rows[at][0] - before, length, file
+    )
+    head = block.head(above) or head_of(above)
     at += head.counts
     start = 0
-    for _ in range(rows[at][0] - 1):
+    for _ in range(rows[at][0] - before - 1):
         start = data.index(b"\n", start) + 1
     body = Body(data, start, file, rows[at][0], delimiter, width, trailing, cells[at])
-    names = head.names or _commented(notes, rows[at][0], delimiter, width)
+    names = head.names or _commented(notes, rows[at][0] - before, delimiter, width)
     return _table(file, names, head, body, _words(cells[at:], width, delimiter))
 
 
@@ -156,28 +182,68 @@ def _commented(
     return names if clock(Table("", columns, True, {"": 1.0}, units_of(names))) else None
 
 
-def _table(file: str, names: list[str] | None, head: Head, body: Body, words: list[int]) -> Table:
-    known: list[str] = []
-    for index in range(body.width):
-        name = (names[index] if names else "") or str(index)
-        if name in known:
-            raise ValueError(f"{file}: column {name!r} appears twice; rename one")
-        known.append(name)
+def _table(
+    file: str, names: Sequence[str] | None, head: Head, body: Body, words: list[int]
+) -> Table:
+    given = [(names[j] if names else "") or str(j) for j in range(body.width)]
+    known = numbered(given)
     body.check()
-    columns = {
-        name: functools.partial(body.column, index, name) for index, name in enumerate(known)
-    }
     units = units_of(known) | {
         name: unit for name, unit in zip(known, head.units, strict=False) if unit
     }
     units |= {known[index]: "s" for index in body.moments}
-    rates = {} if head.rate is None else dict.fromkeys(known, head.rate)
-    return Table(
+    clocks = _clocks(given, known, units)
+    columns = {
+        name: functools.partial(_column, body, known, clocks.get(name), name) for name in known
+    }
+    said = () if known == given else (f"{NUMBERED}{listed(_twice(given))}",)
+    table = Table(
         file,
         columns,
         names is not None,
-        rates,
+        {},
         units,
-        frozenset(known[j] for j in words),
+        frozenset(known[j] for j in {*words, *head.counters}),
         body.place,
+        said,
+        {name: time for name, time in clocks.items() if name != time},
     )
+    rates = dict(zip(known, head.rates or [head.rate] * len(known), strict=False))
+    rates = {name: rate for name, rate in rates.items() if rate is not None}
+    # what a program states is its rate; a line of words gives way to times
+    if not rates or (head.notices and clock(table) is not None):
+        return table
+    return table._replace(rates=rates, notices=(*said, *head.notices))
+
+
+def _twice(names: Sequence[str]) -> list[str]:
+    return [name for name in dict.fromkeys(names) if names.count(name) > 1]
+
+
+def _column(
+    body: Body, known: list[str], time: str | None, name: str
+) -> Float[np.ndarray, " rows"]:
+    """A column, which ends where times of its own do: other columns may be longer."""
+    values = body.column(known.index(name), name)
+    if time is None:
+        return values
+    there = np.flatnonzero(np.isfinite(body.column(known.index(time), time)))
+    return values[: there[-1] + 1] if there.size else values
+
+
+def _clocks(given: list[str], known: list[str], units: Mapping[str, str]) -> dict[str, str]:
+    """The time of every column where there are several columns of times, each before its own: they
+    have one name, or that of what follows."""
+    bare_names = [name_and_unit(name)[0] for name in given]
+    times = [
+        j
+        for j, name in enumerate(known)
+        if seconds(units.get(name)) is not None or bare_names[j] in ("time", "t")
+    ]
+    if len(times) < 2 or times[0] != 0:
+        return {}
+    bares = [bare_names[j] for j in times]
+    own = [_TIME_OF.sub("", bare_names[j]) == "".join(bare_names[j + 1 : j + 2]) for j in times]
+    if len(set(bares)) > 1 and not all(own):
+        return {}
+    return {name: known[max(t for t in times if t <= j)] for j, name in enumerate(known)}

@@ -1,13 +1,15 @@
 """Recordings in files: every format, one column or all of them."""
 
 import contextlib
+import gzip
 import os
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, overload
 
-from jaxmuscle._common.inputs import looked_at, read_bytes
-from jaxmuscle._common.text import printable
+from jaxmuscle._common.inputs import BEYOND, looked_at, most, read_bytes
+from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import require
 
 from ._apart import read_apart
@@ -16,9 +18,15 @@ from ._recording import Recording
 from ._recording_choice import Reading, perturbed_of, recording_of, signals
 from ._recording_csv import read_csv
 from ._recording_table import Table, channels_table, find
-from ._text_tables import TEXT
+from ._recording_time import clock
+from ._text_tables import LOOK, TEXT, holds_text
+from .dialects._dialects import EXPORTS
 
+BOOKS = (".xlsx", ".xlsm")
 KINDS = (*TEXT, ".xlsx", ".mat", ".npy", ".npz", ".c3d", ".edf", ".bdf", ".tdms", ".acq", ".smr")
+KINDS = (*KINDS, ".xlsm", ".gz")
+TARGETS = (".toml", ".json", ".tar")
+ROWS = 90  # that the shortest recording has
 
 
 @overload
@@ -41,6 +49,7 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
     reference: str | int | None = None,
     time: str | int | None = None,
     skip_rows: int = 0,
+    sheet: str | int | None = None,
     max_gap: float | int = 0.2,
     displacement_units: str | None = None,
     lever_arm: float | int | None = None,
@@ -53,8 +62,8 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
         recording = jm.load_recording("trial.csv", column="force", rate=2048, units="N")
         result = jm.fit(jm.Isometric(), recording.steady())
 
-    Text (.csv, .tsv, .txt, .dat, .asc): delimiter, header, a row of units and decimal commas are
-    detected, `#` starts a comment. Headers of LabChart, Spike2, AcqKnowledge and DIAdem are
+    Text, whatever its ending, also packed (.gz): delimiter, header, a row of units and decimal
+    commas are detected, `#` starts a comment. What programs of laboratories write is
     understood. MATLAB: variables by name, `trial.force` for a field of a struct, `Data:74` for a
     column of a table, **counted from 0** as in `Data[:, 74]`. C3D: points, and analog channels.
 
@@ -81,6 +90,7 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
     - `reference`: a column or point to subtract (finger minus stand).
     - `time`: the column that holds the time, if it is not found by itself.
     - `skip_rows`: lines of a text, or rows of a sheet, to leave out at the top.
+    - `sheet`: of a workbook, its name or number from 0; needed if several hold a signal.
     - `max_gap` [s]: gaps (NaN, empty, C3D residual below 0) up to this long are closed by straight
       lines, with a notice.
     - `displacement_units`: m, cm, mm, um, deg or rad; by default what the file states. `units` is
@@ -104,14 +114,14 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
                 value,
                 "belongs to recordings of two channels; give `force` and `displacement`",
             )
-        return recording_of(Recording, read_table(path, skip_rows), reading)
+        return recording_of(Recording, read_table(path, skip_rows, sheet), reading)
     for name in ("column", "axis", "reference"):
         value = getattr(reading, name)
         require(
             value is None, name, value, "leave it out: `force` and `displacement` name the columns"
         )
     columns = {"force": force, "displacement": displacement}
-    table = read_table(path, skip_rows)
+    table = read_table(path, skip_rows, sheet)
     return perturbed_of(
         PerturbedRecording.from_array, table, reading, columns, lever_arm=lever_arm, **options
     )
@@ -123,35 +133,37 @@ def load_columns(
     *,
     time: str | int | None = None,
     skip_rows: int = 0,
+    sheet: str | int | None = None,
     **options: Any,
 ) -> list[Recording]:
     """A recording `FILE COLUMN` of each of the columns, by default of all with numbers but the
-    time.
+    time; of several sheets of a workbook one `FILE SHEET` each, if no columns are named.
 
-    `time`, `skip_rows` and the other options are those of `load_recording`.
+    `time`, `skip_rows`, `sheet` and the other options are those of `load_recording`.
     """
-    table = read_table(path, skip_rows)
-    names = (
-        signals(table, time)
-        if columns is None
-        else [find(table, column, "columns") for column in columns]
-    )
+    tables = read_tables(path, skip_rows, sheet)
+    if columns is None and len(tables) > 1:
+        return [recording_of(Recording, t, Reading(time=time, **options)) for t in tables]
     require(
-        columns is None or len(names) > 0,
+        columns is None or len(columns := list(columns)) > 0,
         "columns",
         columns,
         "give the names of the columns that are recordings",
     )
-    if not names:
-        raise ValueError(f"{table.file}: holds no column with numbers besides the time")
-    stem = printable(Path(table.file).stem)
-    return [
-        recording_of(Recording, table, Reading(name, time=time, **options), f"{stem} {name}")
-        for name in names
-    ]
+    found: list[Recording] = []
+    for table in tables:
+        names = signals(table, time) if columns is None else columns
+        if not names:
+            raise ValueError(f"{table.file}: holds no column with numbers besides the time")
+        for name in (find(table, each, "columns") for each in names):
+            reading = Reading(name, time=time, **options)
+            found.append(recording_of(Recording, table, reading, f"{table.name} {name}"))
+    return found
 
 
-def read_table(path: str | os.PathLike[str] | Table, skip_rows: int = 0) -> Table:
+def read_table(
+    path: str | os.PathLike[str] | Table, skip_rows: int = 0, sheet: str | int | None = None
+) -> Table:
     """The columns of the file of a recording, for who must see them before they know what it holds.
 
         table = jaxmuscle.data.read_table("trial.csv")
@@ -160,13 +172,36 @@ def read_table(path: str | os.PathLike[str] | Table, skip_rows: int = 0) -> Tabl
     `load_recording`, `load_recordings` and `two_channels` take a table in place of the path: the
     file is read once.
 
-    **Arguments:** `path`, `skip_rows` as in `load_recording`; a table is given back as it is.
+    **Arguments:** `path`, `skip_rows`, `sheet` as in `load_recording`; a table is given back as it
+    is.
 
     **Raises:** `ValueError` naming file and line, and the remedy; `ImportError` that says what to
     install.
     """
+    table, *others = read_tables(path, skip_rows, sheet)
+    if others:
+        names = [each.sheet for each in (table, *others)]
+        raise ValueError(
+            f"{os.fspath(path)}: holds {len(names)} sheets with signals, {', '.join(names)}; choose"  # pyright: ignore
+            f" one with `sheet`, as sheet={names[0]!r}; load_recordings takes all as trials"
+        )
+    return table
+
+
+def read_tables(
+    path: str | os.PathLike[str] | Table, skip_rows: int = 0, sheet: str | int | None = None
+) -> list[Table]:
+    """What `read_table` gives of a file; of a workbook of trials one table for each.
+
+        tables = jaxmuscle.data.read_tables("trials.xlsx")
+        trials = jaxmuscle.load_recordings(tables)
+
+    **Arguments:** `path`, `skip_rows`, `sheet` as in `read_table`.
+
+    **Raises:** as `read_table`; but not for several sheets of the same columns.
+    """
     if isinstance(path, Table):
-        return path
+        return [path]
     require(isinstance(path, str | os.PathLike), "path", path, "give the path of a recording")
     file = Path(path)
     with contextlib.suppress(RuntimeError):
@@ -178,17 +213,100 @@ def read_table(path: str | os.PathLike[str] | Table, skip_rows: int = 0) -> Tabl
         skip_rows,
         "give a number of lines",
     )
-    rows = kind in (*TEXT, ".xlsx")
-    require(skip_rows == 0 or rows, "skip_rows", skip_rows, f"leave it out: {kind} has no lines")
     instead = f"a recording ({', '.join(KINDS)})"
+    text = kind in TEXT or is_text(file)
+    book = kind in BOOKS and not text
+    rows = text or book or kind == ".gz"
+    require(skip_rows == 0 or rows, "skip_rows", skip_rows, f"leave it out: {kind} has no lines")
+    require(sheet is None or book, "sheet", sheet, f"leave it out: {file.name} has no sheets")
+    if text:
+        return [read_csv(read_bytes(file, instead=instead), str(file), skip_rows)]
+    if kind == ".gz":
+        return [read_csv(_unpacked(file, instead), str(file), skip_rows)]
     if kind not in KINDS:
         looked_at(file, instead=instead)
+        export = f"; {EXPORTS[kind]}" if kind in EXPORTS else ""
         raise ValueError(
-            f"{file}: a recording is one of {', '.join(KINDS)}, not {kind or 'one without ending'}"
+            f"{file}: a recording is one of {', '.join(KINDS)}, not"
+            f" {kind or 'one without ending'}{export}"
         )
-    if kind in TEXT:
-        return read_csv(read_bytes(file, instead=instead), str(file), skip_rows)
     found = read_apart(file, kind, instead=instead)
-    if isinstance(found, bytes):
-        return read_csv(found, str(file), skip_rows)
-    return channels_table(str(file), found, named=kind != ".npy")
+    if isinstance(found, dict):
+        return _sheets(file, found, skip_rows, sheet)
+    return [channels_table(str(file), found, named=kind != ".npy")]
+
+
+def is_text(file: Path) -> bool:
+    """Whether a file is a text with rows of numbers, though its ending does not say so."""
+    kind = file.suffix.lower()
+    if (kind in (*TARGETS, *KINDS) and kind != ".mat") or not file.is_file():
+        return False
+    with contextlib.suppress(OSError), file.open("rb") as stream:
+        return holds_text(stream.read(LOOK))
+    return False
+
+
+def _unpacked(file: Path, instead: str) -> bytes:
+    """The text in a file that gzip has packed."""
+    looked_at(file, instead=instead)
+    try:
+        with gzip.open(file) as stream:
+            data = stream.read(most() + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise ValueError(f"{file}: cannot be unpacked: {error}") from None
+    if len(data) > most():
+        allowed = most() / 2**30
+        raise ValueError(f"{file}: it holds more than {allowed:.3g} GiB{BEYOND}")
+    if not holds_text(data[:LOOK]):
+        raise ValueError(f"{file}: holds no text with rows of numbers; unpack it (gunzip) first")
+    return data
+
+
+def _sheets(
+    file: Path, sheets: dict[str, bytes], skip_rows: int, asked: str | int | None
+) -> list[Table]:
+    """The sheet that is asked for, or those with a signal, of one layout."""
+    names = list(sheets)
+    filled = [text for text in sheets.values() if text.strip()]
+    if asked is None and len(filled) == 1:
+        return [read_csv(filled[0], str(file), skip_rows)]
+
+    def read(name: str) -> Table:
+        table = read_csv(sheets[name], f"{file}, sheet {name}", skip_rows)
+        return table._replace(sheet=name)
+
+    if asked is not None:
+        return [read(_asked(file, names, asked))]
+    found: dict[str, Table] = {}
+    for name, text in sheets.items():
+        with contextlib.suppress(ValueError):  # what is no table of numbers holds no signal
+            if text.count(b"\n") >= ROWS and signals(table := read(name), None):
+                found[name] = table
+    if len(_layouts(found)) > 1:  # a table of results has no times
+        timed = {name: t for name, t in found.items() if t.rates or clock(t) is not None}
+        found = timed or found
+    layouts = _layouts(found)
+    if len(layouts) != 1:
+        which = ", ".join(found) or "none"
+        raise ValueError(
+            f"{file}: holds the sheets {', '.join(names)}; with {ROWS} rows of numbers or more:"
+            f" {which}. Choose one with `sheet`, as sheet={next(iter(found), names[0])!r}"
+        )
+    others = ", ".join(name for name in names if name not in found)
+    what = f"sheet {next(iter(found))} taken" if len(found) == 1 else "the sheets are trials"
+    more = f", of {', '.join(names)}" if others else f": {', '.join(names)}"
+    return [table._replace(notices=(f"{what}{more}", *table.notices)) for table in found.values()]
+
+
+def _layouts(tables: dict[str, Table]) -> set[tuple[str, ...]]:
+    return {tuple(table.columns) for table in tables.values()}
+
+
+def _asked(file: Path, names: list[str], sheet: str | int) -> str:
+    known = {name.casefold(): name for name in names}
+    wanted = str(sheet).strip().casefold()
+    if isinstance(sheet, str) and wanted in known:
+        return known[wanted]
+    if wanted.isdecimal() and int(wanted) < len(names):
+        return names[int(wanted)]
+    raise ValueError(f"{file}: sheet={sheet!r}: {choices(str(sheet), names)}")

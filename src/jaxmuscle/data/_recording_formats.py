@@ -2,15 +2,17 @@
 `_apart_child` alone."""
 
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ._recording_channels import Channel, TooLarge
+from .dialects._dialects import DIALECTS
+from .dialects._variables import stated
 
-RATES = ("samplingfrequency", "samplingrate", "samplerate", "sampling_rate", "fs", "rate", "srate")
-REFERENCES = 16  # how often a reference of HDF5 may lead to another one
+REFERENCES = 16  # how often a cell may hold another one alone
+CELLS = 10_000  # of a variable
 ABROAD = "takes its numbers from another file, which is not followed; save them in the file itself"
 
 
@@ -37,94 +39,124 @@ def unpacked(path: str, most: int) -> None:
 
 def read_mat(path: str, most: int) -> list[Channel]:
     """MATLAB's variables by name; fields of structs as `trial.force`, columns as `Data:74`
-    (MATLAB's Data(:, 75))."""
+    (MATLAB's Data(:, 75)); or what the programs of `dialects` write."""
     import scipy.io
 
     try:
-        content = scipy.io.loadmat(path, simplify_cells=True)
+        content = scipy.io.loadmat(path, simplify_cells=True, mat_dtype=True)
     except NotImplementedError:
-        return _channels(_hdf5(path, most))
-    return _channels(
-        dict(_flat({key: value for key, value in content.items() if not key.startswith("__")}))
-    )
+        content = _hdf5(path, most)
+    content = {key: _alone(value) for key, value in content.items() if not key.startswith("__")}
+    for dialect in DIALECTS:
+        found = dialect.mat and dialect.mat(content)
+        if found:
+            channels, understood = found
+            rest = {key: value for key, value in content.items() if key not in understood}
+            return [*channels, *_channels(rest, channels)]
+    return _channels(content)
+
+
+def _alone(value: Any) -> Any:
+    """What is in a cell that holds nothing else; in structs, too."""
+    for _ in range(REFERENCES):
+        cell = value.reshape(-1) if isinstance(value, np.ndarray) else value
+        if isinstance(cell, np.ndarray) and cell.dtype == bool:
+            return value.astype(np.uint8)
+        single = isinstance(cell, list) or (isinstance(cell, np.ndarray) and cell.dtype == object)
+        if not single or len(cell) != 1:
+            break
+        value = cell[0]
+    if isinstance(value, Mapping):
+        return {key: _alone(each) for key, each in value.items()}
+    return value
 
 
 def _flat(content: Mapping[str, Any], stem: str = "") -> Iterable[tuple[str, Any]]:
-    """Numbers in nested structs, and those in a cell that holds nothing else."""
+    """What nested structs hold."""
     for key, value in content.items():
-        while (
-            isinstance(value, np.ndarray | list)
-            and np.size(value) == 1
-            and np.asarray(value).dtype == object
-        ):
-            value = np.asarray(value).item()
         if isinstance(value, Mapping):
             yield from _flat(value, f"{stem}{key}.")
         else:
-            yield f"{stem}{key}", np.asarray(value)
+            yield f"{stem}{key}", value
 
 
-def _hdf5(path: str, most: int) -> dict[str, np.ndarray]:
-    """MATLAB v7.3: its arrays lie transposed, its cells as references."""
+def _hdf5(path: str, most: int) -> dict[str, Any]:
+    """MATLAB v7.3: its arrays lie transposed, its cells as references, its texts as numbers."""
     import h5py
 
-    arrays: dict[str, np.ndarray] = {}
-    with h5py.File(path, "r", locking=False) as file:
+    known: dict[Any, Any] = {}  # by the place in the file, so that a circle comes to an end
+    left = most
 
-        def visit(name: str, item: Any) -> None:
-            if isinstance(item, h5py.Group) and _leads_out(item, h5py.ExternalLink):
+    def value(item: Any) -> Any:
+        nonlocal left
+        place = h5py.h5o.get_info(item.id).addr  # pyright: ignore[reportAttributeAccessIssue]
+        if place in known:
+            return known[place]
+        known[place] = None
+        if isinstance(item, h5py.Group):
+            known[place] = {name: value(item[name]) for name in _inside(item)}
+        elif isinstance(item, h5py.Dataset) and "MATLAB_empty" not in item.attrs:
+            if item.external or item.is_virtual:
                 raise ValueError(ABROAD)
-            for _ in range(REFERENCES):
-                if (
-                    not isinstance(item, h5py.Dataset)
-                    or item.dtype != h5py.ref_dtype
-                    or item.size != 1
-                ):
-                    break
-                item = file[np.asarray(item).item()]
-            if (
-                not isinstance(item, h5py.Dataset)
-                or name.startswith("#")
-                or "MATLAB_empty" in item.attrs
-            ):
-                return
-            if item.dtype.kind in "iuf" and item.attrs.get("MATLAB_class") != b"char":
-                if item.external or item.is_virtual:
-                    raise ValueError(ABROAD)
-                if sum(array.nbytes for array in arrays.values()) + item.nbytes > most:
-                    raise TooLarge
-                arrays[name.replace("/", ".")] = np.asarray(item).T
+            left -= item.nbytes
+            if left < 0:
+                raise TooLarge
+            cells = item.dtype == h5py.ref_dtype and np.prod(item.shape) <= CELLS
+            known[place] = (
+                [value(file[each]) if each else None for each in np.asarray(item).reshape(-1)]
+                if cells
+                else _matlab(item)
+            )
+        return known[place]
 
-        visit("#", file)
-        file.visititems(visit)
-    return arrays
+    with h5py.File(path, "r", locking=False) as file:
+        return value(file)
 
 
-def _leads_out(group: Any, kind: type) -> bool:
-    return any(isinstance(group.get(name, getlink=True), kind) for name in group)
+def _inside(group: Any) -> list[str]:
+    """The names of what a group holds itself."""
+    import h5py
+
+    links = {name: group.get(name, getlink=True) for name in group if not name.startswith("#")}
+    if any(isinstance(link, h5py.ExternalLink) for link in links.values()):
+        raise ValueError(ABROAD)
+    return [name for name, link in links.items() if isinstance(link, h5py.HardLink)]
 
 
-def _channels(arrays: Mapping[str, Any]) -> list[Channel]:
+def _matlab(item: Any) -> Any:
+    """Numbers, or the lines of a text."""
+    if item.dtype.kind not in "iuf":
+        return None
+    array = np.asarray(item).T
+    if item.attrs.get("MATLAB_class") != b"char":
+        return array.squeeze() if array.ndim < 3 else array
+    lines = ["".join(map(chr, line)) for line in np.atleast_2d(array)]
+    return lines[0] if len(lines) == 1 else lines
+
+
+def _channels(content: Mapping[str, Any], beside: Sequence[Channel] = ()) -> list[Channel]:
     """Columns of all numeric arrays with one or two dimensions; a two-dimensional one has its
-    samples along the longer."""
-    found: list[Channel] = []
-    rate = None
-    for name, value in arrays.items():
-        array = np.asarray(value)
-        if array.dtype.kind not in "iuf":
+    samples along the longer. Rates, names and units are those that stand beside an array.
+
+    **Raises:** `ValueError` where there are none, not even `beside` these.
+    """
+    variables = dict(_flat(content))
+    found: dict[str, list[Channel]] = {}
+    for name, value in variables.items():
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf":
             continue
-        if array.size == 1 and name.rpartition(".")[2].casefold() in RATES:
-            rate = float(array.item())
+        array = value
         array = (
             array.reshape(-1, 1)
             if array.ndim < 2 or array.shape in ((1, array.size), (array.size, 1))
             else array
         )
         if array.ndim == 2 and array.shape[0] >= 2 and array.shape[1]:
-            found += _columns(name, array.T if array.shape[0] < array.shape[1] else array)
-    if not found:
+            upright = array.T if array.shape[0] < array.shape[1] else array
+            found[name] = list(_columns(name, upright))
+    if not found and not beside:
         raise ValueError("holds no numbers in one or two dimensions")
-    return [channel._replace(rate=rate) for channel in found]
+    return stated(variables, found)
 
 
 def _columns(name: str, array: np.ndarray) -> Iterator[Channel]:

@@ -16,18 +16,23 @@ def _library(name: str) -> Any:
         raise ImportError(f"reading this file needs {what}: pip install {what}") from None
 
 
-def read_xlsx(path: str, most: int) -> bytes:
-    """The first sheet of a workbook as text with tabs, in which rows keep their numbers."""
+def read_xlsx(path: str, most: int) -> dict[str, bytes]:
+    """The sheets of a workbook as texts with tabs, in which rows keep their numbers."""
     _library("openpyxl")
     import pandas
 
     unpacked(path, most)
-    sheet = pandas.read_excel(path, header=None, engine="openpyxl")
-    if sheet.empty:
-        raise ValueError("its first sheet is empty")
-    return (
-        sheet.replace(r"\s+", " ", regex=True).to_csv(sep="\t", header=False, index=False).encode()
-    )
+    with pandas.ExcelFile(path, engine="openpyxl") as book:
+        names = [sheet.title for sheet in book.book.worksheets]  # there are sheets of charts, too
+        sheets: dict[str, Any] = {name: book.parse(name, header=None) for name in names}
+    if all(sheet.empty for sheet in sheets.values()):
+        raise ValueError("it holds no sheet that is not empty")
+    return {
+        name: sheet.replace(r"\s+", " ", regex=True)
+        .to_csv(sep="\t", header=False, index=False)
+        .encode()
+        for name, sheet in sheets.items()
+    }
 
 
 def read_edf(path: str, most: int) -> list[Channel]:

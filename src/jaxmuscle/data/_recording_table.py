@@ -4,13 +4,16 @@ import difflib
 import functools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle._common.text import printable
+
 from ._recording_channels import Channel, numbers
-from ._units import name_and_unit
+from ._units import name_and_unit, seconds
 
 TRIPLES = (
     ("_x", "_y", "_z"),
@@ -21,6 +24,7 @@ TRIPLES = (
     (":0", ":1", ":2"),
 )
 AXES = ("x", "y", "z")
+_COORDINATE = re.compile(r"[_.: ][xyz]$", re.IGNORECASE)
 
 
 class Table(NamedTuple):
@@ -28,7 +32,9 @@ class Table(NamedTuple):
 
     `columns` are functions, so that only those that are asked for are read; `named` is false where
     names are only numbers; `rates` [Hz] and `units` by column, where the file states them; `words`
-    are columns that hold no numbers; `place` is how messages call a row.
+    are columns that hold no signals; `place` is how messages call a row; `notices` say what the
+    reader decided; `clocks` are the columns of times that belong to others, by these; `aliases` are
+    further names of columns; `sheet` is that of a workbook with several.
     """
 
     file: str
@@ -38,6 +44,21 @@ class Table(NamedTuple):
     units: Mapping[str, str] = {}
     words: frozenset[str] = frozenset()
     place: Callable[[int], str] = "sample {}".format
+    notices: tuple[str, ...] = ()
+    clocks: Mapping[str, str] = {}
+    aliases: Mapping[str, str] = {}
+    sheet: str = ""
+
+    @property
+    def name(self) -> str:
+        """What a recording of it is called: the file, and the sheet of several."""
+        stem = Path(self.file.removesuffix(self.of_sheet)).stem
+        return printable(f"{stem} {self.sheet}".strip())
+
+    @property
+    def of_sheet(self) -> str:
+        """What stands behind the name of the file in messages."""
+        return f", sheet {self.sheet}" if self.sheet else ""
 
 
 def channels_table(file: str, channels: Sequence[Channel], *, named: bool = True) -> Table:
@@ -47,13 +68,51 @@ def channels_table(file: str, channels: Sequence[Channel], *, named: bool = True
         for channel in channels
     }
     rates = {channel.name: channel.rate for channel in channels if channel.rate is not None}
+    # of a struct that states no rate
+    times = {
+        stem: name
+        for name in columns
+        for stem, _, last in [name.rpartition(".")]
+        if stem and last.casefold() in ("time", "t")
+    }
+    clocks = {
+        name: time
+        for name in columns
+        if name not in rates and (time := times.get(name.rpartition(".")[0])) not in (None, name)
+    }
     return Table(
         file,
         columns,
         named,
         rates,
         {channel.name: channel.unit for channel in channels if channel.unit},
+        clocks=clocks,
+        aliases={channel.alias: channel.name for channel in channels if channel.alias},
     )
+
+
+def merged(file: str, tables: Sequence[Table]) -> Table:
+    """The tables of a file as one: columns that several have are told apart by the block."""
+    if len(tables) == 1:
+        return tables[0]
+    often = [name for table in tables for name in table.columns]
+    columns: dict[str, Any] = {}
+    rates, units, clocks = dict[str, float](), dict[str, str](), dict[str, str]()
+    words: set[str] = set()
+    for block, table in enumerate(tables, 1):
+        new = {
+            name: name if often.count(name) == 1 else f"{name}, block {block}"
+            for name in table.columns
+        }
+        times = [name for name in new if seconds(table.units.get(name)) is not None]
+        own = table.clocks or {name: time for time in times[:1] for name in new if name != time}
+        columns |= {new[name]: column for name, column in table.columns.items()}
+        rates |= {new[name]: rate for name, rate in table.rates.items()}
+        units |= {new[name]: unit for name, unit in table.units.items()}
+        clocks |= {new[name]: new[time] for name, time in own.items()}
+        words |= {new[name] for name in table.words}
+    said = tuple(dict.fromkeys(notice for table in tables for notice in table.notices))
+    return Table(file, columns, True, rates, units, frozenset(words), notices=said, clocks=clocks)
 
 
 def frame_table(frame: Any) -> Table:
@@ -100,11 +159,13 @@ def units_of(names: Iterable[str]) -> dict[str, str]:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Names for a message: columns 0 to n of one variable as a range, and not more than 30."""
+    """Names for a message: columns 0 to n of one variable as a range, and not more than 30; those
+    of points last, of which there are many."""
     groups: dict[str, list[str]] = {}
-    for name in names:
+    for name in sorted(names, key=lambda name: _COORDINATE.search(name) is not None):
         stem, _, index = name.rpartition(":")
         groups.setdefault(stem if stem and index.isdigit() else name, []).append(name)
+    groups = {stem: [repr(n) if ", " in n else n for n in group] for stem, group in groups.items()}
     short = [
         group[0] if len(group) == 1 else f"{group[0]} to {group[-1]}" for group in groups.values()
     ]
@@ -119,6 +180,9 @@ def find(table: Table, column: str | int, argument: str = "column") -> str:
     """
     names = list(table.columns)
     exact = _find(names, column)
+    if exact is None and table.aliases:
+        exact = _find(list(table.aliases), column)
+        exact = None if exact is None else table.aliases[exact]
     if exact is not None:
         return exact
     stem = str(column).casefold()
@@ -127,7 +191,7 @@ def find(table: Table, column: str | int, argument: str = "column") -> str:
             f"{table.file}: {argument}={column!r} is a point of three columns; give axis='x', 'y',"
             " 'z' or 'principal'"
         )
-    if any(name.casefold() == f"{stem}:0" for name in names):
+    if any(name.casefold() == f"{stem}:0" for name in (*names, *table.aliases)):
         raise ValueError(
             f"{table.file}: {argument}={column!r} has several columns; choose one, as {column}:0"
             " (counted from 0)"

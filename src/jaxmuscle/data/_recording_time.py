@@ -29,12 +29,15 @@ class Clock(NamedTuple):
     guessed: bool
 
 
-def clock(table: Table, asked: str | int | None = None) -> Clock | None:
-    """The column that is asked for, or is called time, or has a unit of time; else a first one that
-    rises evenly."""
+def clock(table: Table, asked: str | int | None = None, column: str | None = None) -> Clock | None:
+    """The column that is asked for, or has the times of the `column`, or is called time, or has a
+    unit of time; else a first one that rises evenly."""
     if asked is not None:
         name = find(table, asked, "time")
         return Clock(name, _scale(table, name) or 1.0, False)
+    own = table.clocks.get(column or "")
+    if own is not None:
+        return Clock(own, _scale(table, own) or 1.0, False)
     called = [name for name in table.columns if _TIME.fullmatch(bare(name))]
     timed = [
         *called,

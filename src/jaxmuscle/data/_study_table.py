@@ -28,7 +28,7 @@ LONGEST_HEAD = 4096  # letters of the first line that are looked at
 TABLES = "the table of a study (.csv, .tsv, .txt or .toml)"
 LABELS = (*NEEDED, "group", "condition", "trial")
 # of `load_recording`, of `Trials.target`
-FILES, SPECTRA = (*Reading._fields, "skip_rows"), ("spectrum", "mvc")
+FILES, SPECTRA = (*Reading._fields, "skip_rows", "sheet"), ("spectrum", "mvc")
 EDGES = ("window_start", "window_stop")
 STEADY = "`window` of the study.toml, else its steady part; an error beside the other edge"
 NUMBERS = ("rate", "max_gap", "lever_arm", "skip_rows", "mvc", *EDGES)
@@ -93,6 +93,13 @@ class ReadingTable(Table, kw_only=True):
     ] = None
     skip_rows: Annotated[
         Annotated[int, Meta(ge=0)] | None, says("Lines to leave out at the top", missing="0")
+    ] = None
+    sheet: Annotated[
+        str | int | None,
+        says(
+            "Sheet of a workbook: its name, or its number from 0",
+            missing="the only one with a signal; else an error",
+        ),
     ] = None
     spectrum: Annotated[
         str | None,

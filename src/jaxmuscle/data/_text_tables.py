@@ -2,11 +2,13 @@
 commas."""
 
 import csv
+import re
 from pathlib import Path
 from typing import NamedTuple
 
 SIGNS = ("\t", ";", ",")
 TEXT = (".csv", ".tsv", ".txt", ".dat", ".asc")  # files that hold one
+LOOK_AT = 100  # cells of a line
 LOOK = 1 << 16  # bytes of a file that say what it is
 
 
@@ -75,6 +77,19 @@ def width_remedy(delimiter: str | None) -> str:
         if delimiter == ","
         else remedy
     )
+
+
+def holds_text(begin: bytes) -> bool:
+    """Whether what a file begins with is text with rows of numbers, whatever its ending says."""
+    wide = begin[:2] in (b"\xff\xfe", b"\xfe\xff")
+    text = begin.decode("utf-16" if wide else "latin-1", errors="replace")
+    return "\0" not in text and any(map(_is_row, text.splitlines()))
+
+
+def _is_row(line: str) -> bool:
+    cells = re.split(r"[\t;, ]+", line.strip('\t;, "'))
+    numbers = sum(is_number(cell, ",") for cell in cells[:LOOK_AT])
+    return numbers > 0 and 2 * numbers >= len(cells[:LOOK_AT])
 
 
 def beginning(path: Path) -> tuple[list[str], list[str], str | None]:

@@ -14,7 +14,7 @@ from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum
 
 from ._recording import Recording, notices_of, pooled_target, recorded_settings
-from ._recording_files import load_columns, load_recording
+from ._recording_files import load_columns, load_recording, read_tables
 from ._recording_table import Table
 from ._target import Target
 
@@ -155,6 +155,7 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
     reference: str | int | None = None,
     time: str | int | None = None,
     skip_rows: int = 0,
+    sheet: str | int | None = None,
     max_gap: float | int = 0.2,
     lever_arm: float | int | None = None,
 ) -> Trials:
@@ -168,8 +169,9 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
       `jaxmuscle.data.read_table` read of them)
     - `columns`: which columns of this one file are trials (by default all with numbers but the
       time)
-    - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap`, `lever_arm`:
-      as in `load_recording`, the same for all files
+    - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `sheet`, `max_gap`,
+      `lever_arm`: as in `load_recording`, the same for all files. Several sheets of one layout in
+      a workbook are trials, unless `sheet` names one
 
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does,
     and for different units.
@@ -180,7 +182,6 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
         "axis": axis,
         "reference": reference,
         "time": time,
-        "skip_rows": skip_rows,
         "max_gap": max_gap,
         "lever_arm": lever_arm,
     }
@@ -191,10 +192,11 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
             column,
             "one file holds all trials here; name several with `columns`",
         )
-        return Trials(load_columns(paths, columns, **options))
+        return Trials(load_columns(paths, columns, skip_rows=skip_rows, sheet=sheet, **options))
     files = list(paths)
     if columns is not None:
         raise ValueError(
             "columns: these are for one file that holds all trials; give its path alone, as a text"
         )
-    return Trials(load_recording(path, column=column, **options) for path in files)
+    tables = [table for path in files for table in read_tables(path, skip_rows, sheet)]
+    return Trials(load_recording(table, column=column, **options) for table in tables)

@@ -13,7 +13,7 @@ from jaxmuscle.spectra._settings import require
 from ._as_target import is_recording
 from ._perturbed import PerturbedRecording
 from ._recording_choice import FORCE, Reading, perturbed_of, signals
-from ._recording_files import read_table
+from ._recording_files import read_table, read_tables
 from ._recording_table import Table, bare, find, listed, values
 from ._units import quantity_of, scale_to_si
 
@@ -139,7 +139,7 @@ def perturbed_recordings(
         isinstance(one, str | os.PathLike) and is_recording(one) for one in several
     ):
         return ()
-    tables = [read_table(one, 0) for one in several]
+    tables = [table for one in several for table in read_tables(one)]
     channels = [_found_in(table, None, None, None) for table in tables]
     if not channels or not all(channels):
         return ()

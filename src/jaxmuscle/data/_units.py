@@ -2,17 +2,18 @@
 
 import math
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.units import NEWTONS
-from jaxmuscle.spectra._settings import require
 
-from ._target_fields import Quantity
+if TYPE_CHECKING:
+    from ._target_fields import Quantity
 
-UNITS: dict[str, Quantity | None] = {
+UNITS: "dict[str, Quantity | None]" = {
     "N": "force",
     "mN": "force",
     "kN": "force",

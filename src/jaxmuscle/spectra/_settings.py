@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
+from jaxmuscle._common.arguments import require as require
 from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.documents import converted
 from jaxmuscle._common.text import choices
@@ -52,12 +53,6 @@ def taper_of(window: Window, samples: int) -> Float[np.ndarray, " samples"]:
 
 def _python(value: Any) -> Any:
     return value.item() if isinstance(value, np.number) else value
-
-
-def require(holds: bool | np.bool, name: str, value: object, remedy: str) -> None:
-    """Raises the `ValueError` of a wrong argument: its name, its value, and what would be right."""
-    if not holds:
-        raise ValueError(f"{name}={value!r}: {remedy}")
 
 
 class SpectrumSettings(Spelled, eqx.Module):
