@@ -156,6 +156,7 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
     time: str | int | None = None,
     skip_rows: int = 0,
     max_gap: float | int = 0.2,
+    outliers: str = "keep",
     lever_arm: float | int | None = None,
 ) -> Trials:
     """Load the trials of one person in one condition.
@@ -168,8 +169,8 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
       `jaxmuscle.data.read_table` read of them)
     - `columns`: which columns of this one file are trials (by default all with numbers but the
       time)
-    - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap`, `lever_arm`:
-      as in `load_recording`, the same for all files
+    - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap`, `outliers`,
+      `lever_arm`: as in `load_recording`, the same for all files
 
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does,
     and for different units.
@@ -182,6 +183,7 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
         "time": time,
         "skip_rows": skip_rows,
         "max_gap": max_gap,
+        "outliers": outliers,
         "lever_arm": lever_arm,
     }
     if isinstance(paths, str | os.PathLike | Table):
