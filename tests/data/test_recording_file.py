@@ -345,7 +345,6 @@ def test_c3d_written_by_the_library(tmp_path):
 
 H = "time,force\n"
 ROWS = text(TIME, X)
-GAP = text(np.delete(TIME, 20), X[1:], header="time,force")
 HOLE = text(TIME / 0.1, [*map(str, X[:10]), *[""] * 25, *map(str, X[35:])], header="time,force")
 POINT = text(TIME, *XYZ.T, *STAND.T, header="time," + ",".join(NAMES))
 TWO = text(X, X + 1, header="force,torque")
@@ -392,8 +391,11 @@ BAD = {
         {"rate": 2048},
         "rate=2048 Hz contradicts the time column 'time', which has 1000 Hz",
     ),
-    "seconds or not": (text(np.arange(40), X, header="time,force"), {}, "rate=1.0: too slow"),
-    "time not uniform": (GAP, {}, "is not uniform: after 0.019 s (line 21) comes 0.021 s"),
+    "seconds or not": (
+        text(np.arange(40), X, header="time,force"),
+        {},
+        "times look like ms or row numbers (40 rows",
+    ),
     "time beyond all": (
         H + "1e400,1\n0.001,2\n0.002,3\n",
         {},

@@ -196,7 +196,11 @@ _Reference = Annotated[
 _Time = Annotated[
     str | None,
     typer.Option(
-        metavar="NAME", help="Column that holds the time, if the program does not find it."
+        metavar="NAME",
+        help=(
+            "Column that holds the time, if the program does not find it; none: leave the times"
+            " out, the rows are even at --rate."
+        ),
     ),
 ]
 _Sheet = Annotated[
@@ -259,6 +263,19 @@ READING: dict[str, tuple[Any, Any]] = {
         0.2,
     ),
     "lever_arm": (_Arm, None),
+    "outliers": (
+        Annotated[
+            str,
+            typer.Option(
+                metavar="keep|mask",
+                help=(
+                    "Samples that cannot be, as -9999 or single spikes: keep them, with a notice,"
+                    " or mask them as gaps."
+                ),
+            ),
+        ],
+        "keep",
+    ),
 }
 _Force = Annotated[
     str | None, typer.Option(metavar="NAME", help="For a moved insertion: the column of the force.")

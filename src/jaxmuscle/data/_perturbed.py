@@ -85,6 +85,7 @@ class PerturbedRecording(Printed, eqx.Module):
     - `displacement`: a `Recording` in m, of the same rate, start, window and number of samples.
     - `name`, `source`: by default those of the force.
     - `notices`: what was done to the channels, in sentences; those of both channels are added.
+    - `others`: recordings before and after a pause, as in `Recording`.
 
     `jaxmuscle.load_recording(path, force=..., displacement=...)` reads one from a file, and
     converts units and sign.
@@ -97,6 +98,7 @@ class PerturbedRecording(Printed, eqx.Module):
     name: str = eqx.field(static=True)
     source: str = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
+    others: tuple["PerturbedRecording", ...]
 
     def __init__(
         self,
@@ -106,6 +108,7 @@ class PerturbedRecording(Printed, eqx.Module):
         name: str | None = None,
         source: str | None = None,
         notices: Iterable[str] = (),
+        others: Iterable["PerturbedRecording"] = (),
     ):
         for argument, given, unit in (("force", force, "N"), ("displacement", displacement, "m")):
             require(
@@ -131,7 +134,7 @@ class PerturbedRecording(Printed, eqx.Module):
             f"{sizes[1]} samples",
             f"the force has {sizes[0]}; give one length",
         )
-        self.force, self.displacement = force, displacement
+        self.force, self.displacement, self.others = force, displacement, tuple(others)
         self.name, self.source = (
             force.name if name is None else name,
             force.source if source is None else source,
@@ -158,6 +161,7 @@ class PerturbedRecording(Printed, eqx.Module):
         start: float | int = 0.0,
         window: Sequence[float | int] | None = None,
         notices: Iterable[str] = (),
+        others: Iterable["PerturbedRecording"] = (),
     ) -> "PerturbedRecording":
         """A recording from two arrays of one length; torque and angle are converted with the lever
         arm.
@@ -174,7 +178,7 @@ class PerturbedRecording(Printed, eqx.Module):
           with the other sign, that of the displacement is turned, and a notice says so.
         - `delay` [s]: by which the force channel lags behind the displacement channel; the
           displacement is shifted by it.
-        - `name`, `source`, `start`, `window`, `notices`: as in `Recording`.
+        - `name`, `source`, `start`, `window`, `notices`, `others`: as in `Recording`.
 
         **Raises:** `ValueError` naming the argument, its value and the remedy.
         """
@@ -234,6 +238,7 @@ class PerturbedRecording(Printed, eqx.Module):
             held,
             _recording("displacement", turn * moved, rate, "m", fields),
             notices=(*notices, *said, *more),
+            others=others,
         )
 
     @property
@@ -256,6 +261,9 @@ class PerturbedRecording(Printed, eqx.Module):
 
         **Raises:** `ValueError` as `Recording.steady`.
         """
+        for part in self.others if window is not None else ():
+            if part.force.holds(window):
+                return part.steady(window)
         try:
             held = self.force.steady(window)
         except ValueError:

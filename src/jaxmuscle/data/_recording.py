@@ -21,6 +21,7 @@ from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
 from ._measured import AS_RECORDED, RECORDED, measure_signals, tremor_band
 from ._recording_choice import Reading, recording_of
+from ._recording_outliers import OUTSIDE, Burst, find_bursts
 from ._recording_quality import RecordingSummary, checked, clipping, plateau, running_median
 from ._recording_table import frame_table
 from ._target import Target
@@ -33,6 +34,7 @@ SHORTEST = (RECORDED.length + (SEGMENTS - 1) * RECORDED.step) / RECORDED.rate  #
 DRIFT = 0.5  # share of the variance
 UNLIKE = 1.1  # ratio of the means of two trials
 UNRAMPED = "steady part: no ramp found, so all of the recording is used"
+BURST = "the force leaves its level"
 FOUND = "steady part found automatically: "
 
 
@@ -51,6 +53,8 @@ class Recording(Shown, eqx.Module):
     - `notices`: what was done to the samples, in sentences.
     - `recorded_at` [Hz]: the rate before the samples were resampled, by default `rate`. What lay
       above half of it has folded to lower frequencies; a target states it, and its fit expects it.
+    - `others`: recordings before and after a pause, of which `steady` takes the one that holds the
+      window.
 
     `whole` holds all samples, since filters run before the window is cut; `samples` and `time` are
     the window's.
@@ -68,6 +72,7 @@ class Recording(Shown, eqx.Module):
     window: tuple[float, float] | None = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
     recorded_at: float = eqx.field(static=True)
+    others: tuple["Recording", ...]
 
     def __init__(  # noqa: PLR0913 (all that is known of a recording)
         self,
@@ -81,6 +86,7 @@ class Recording(Shown, eqx.Module):
         window: Sequence[float | int] | None = None,
         notices: Iterable[str] = (),
         recorded_at: float | int | None = None,
+        others: Iterable["Recording"] = (),
     ):
         self.rate, self.start, self.name, self.source = _rate(rate), float(start), name, source
         self.recorded_at = self.rate if recorded_at is None else _rate(recorded_at)
@@ -88,7 +94,9 @@ class Recording(Shown, eqx.Module):
         require(spelled is not None, "unit", unit, choices(unit, UNITS))
         self.unit = str(spelled)
         self.whole = checked(samples, self.rate, self.start)
-        own = clipping(self.whole, self.rate, self.start)
+        self.others, notices = tuple(others), tuple(notices)
+        marked = any(OUTSIDE in notice for notice in notices)
+        own = [] if marked else clipping(self.whole, self.rate, self.start)
         if self.rate < RECORDED.rate:
             own.append(f"recorded at {self.rate:g} Hz: holds nothing above {self.rate / 2:g} Hz")
         self.notices = tuple(dict.fromkeys((*notices, *own)))
@@ -107,6 +115,7 @@ class Recording(Shown, eqx.Module):
         time: str | int | None = None,
         max_gap: float | int = 0.2,
         lever_arm: float | int | None = None,
+        outliers: str = "keep",
         name: str = "recording",
     ) -> "Recording":
         """A recording from a pandas table, by the rules for tables in files.
@@ -117,7 +126,7 @@ class Recording(Shown, eqx.Module):
 
         **Raises:** `ValueError` naming column, row or argument, and the remedy.
         """
-        reading = Reading(column, rate, units, axis, reference, time, max_gap, lever_arm)
+        reading = Reading(column, rate, units, axis, reference, time, max_gap, lever_arm, outliers)
         return recording_of(cls, frame_table(frame), reading, name)
 
     @classmethod
@@ -169,15 +178,24 @@ class Recording(Shown, eqx.Module):
             a, b = (float(edge) for edge in window)
         except (TypeError, ValueError):
             raise ValueError(f"window={window!r}: give two times in s, as (8, 25)") from None
+        parts = [f", or {part.start:g} <= ... <= {part.stop:g} s" for part in self.others]
         remedy = (
             f"give times with {self.start:g} <= start < stop <= {self.stop:g} s, the"
-            " recording's own"
+            f" recording's own{''.join(parts)}"
         )
         near = 0.5 / self.rate
         require(
             self.start - near <= a < b <= self.stop + near, f"{self.name}: window", window, remedy
         )
         return a, b
+
+    def holds(self, window: Any) -> bool:
+        """Whether a window lies in it."""
+        try:
+            self._checked(window)
+        except ValueError:
+            return False
+        return True
 
     def span(self, rate: float | int) -> tuple[int, int]:
         """The window as sample numbers at a rate."""
@@ -259,6 +277,11 @@ class Recording(Shown, eqx.Module):
         **Raises:** `ValueError` if no plateau is found, and if the window is shorter than two Welch
         segments (3.84 s).
         """
+        for part in self.others if window is not None else ():
+            if part.holds(window):
+                return part.steady(window)
+        if window is not None:
+            self._checked(window)
         notices, found = self.notices, None
         if window is None:
             even = self.resampled(RECORDED.rate)
@@ -545,8 +568,14 @@ def notices_of(
     """What to mind of recordings of one condition, whose windows hold these low-passed signals;
     `more` of each of them."""
     unit, held = recordings[0].unit, quantity in ("force", "torque")
-    ramps = [_ramped(x, rate, unit) if held else () for x in signals]
-    each = [(*ramp, *own) for ramp, own in zip(ramps, more, strict=True)]
+    bursts = find_bursts(signals, rate) if held else []
+    seen = [_events(r, [b for b in bursts if b.signal == i]) for i, r in enumerate(recordings)]
+    # a slip of a second looks like another level
+    seen = [
+        own or (_ramped(x, rate, unit) if held else ())
+        for own, x in zip(seen, signals, strict=True)
+    ]
+    each = [(*event, *own) for event, own in zip(seen, more, strict=True)]
     unclear = (
         f"the unit {unit} does not say what was measured: is it the right column? A coefficient of"
         " variation makes sense only of a signal that is zero without force, and in proportion"
@@ -560,6 +589,16 @@ def notices_of(
         else ()
     )
     return (*_notices(recordings, each), *alike)
+
+
+def _events(recording: Recording, bursts: Sequence[Burst]) -> tuple[str, ...]:
+    """What to say of a cough or a slip in a window."""
+    begin = recording.start if recording.window is None else recording.window[0]
+    return tuple(
+        f"{BURST} from {begin + b.start:.1f} to {begin + b.stop:.1f} s, {b.times:.2g} times as much"
+        " as usual (a cough, a slip?). Give a window without it, or leave this trial out"
+        for b in bursts
+    )
 
 
 def _ramped(x: Float[np.ndarray, " times"], rate: float, unit: str) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """From a table to a recording: choose a column or a point, find rate and unit, close short gaps."""
 
+import contextlib
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -12,9 +13,10 @@ from jaxtyping import Float
 from jaxmuscle._common.text import choices, printable
 from jaxmuscle.spectra._settings import require
 
+from ._recording_outliers import OUTLIERS, find_outliers
 from ._recording_quality import filled
 from ._recording_table import AXES, Table, bare, find, listed, points, triple, values
-from ._recording_time import clock, sampling
+from ._recording_time import Clock, Part, Sampling, clock, sampling
 from ._units import UNITS, known_unit, quantity_of, scale_to_si
 
 # what a column of force is called, by decomposition programs the signal of reference
@@ -40,28 +42,66 @@ class Reading(NamedTuple):
     time: str | int | None = None
     max_gap: float | int = 0.2
     lever_arm: float | int | None = None
+    outliers: str = "keep"
+
+
+def _sampled(
+    table: Table, signal: np.ndarray, name: str, times: Clock | None, reading: Reading
+) -> tuple[Sampling, np.ndarray]:
+    """How columns are sampled, and what to say of it; the columns, without outliers if that is
+    asked for."""
+    longest = reading.max_gap
+    require(
+        isinstance(longest, int | float) and 0 <= longest < math.inf,
+        "max_gap",
+        longest,
+        "give a time in s",
+    )
+    require(reading.outliers in OUTLIERS, "outliers", reading.outliers, "choose keep or mask")
+    found = sampling(table, name, times, signal.shape[0], reading.rate, float(longest))
+    seconds = np.arange(len(signal)) / found.rate if found.time is None else found.time
+    odd, words = find_outliers(signal, seconds)
+    if reading.outliers == "mask":
+        signal = np.where(odd[:, None], np.nan, signal)
+    told = [each + OUTLIERS[reading.outliers] for each in words]
+    return found._replace(notices=[*found.notices, *told]), signal
+
+
+def _of_parts(
+    make: Callable[..., Any],
+    found: Sampling,
+    signal: np.ndarray,
+    longest: float,
+    notices: list[str],
+) -> Any:
+    """What `make` makes of the longest part, gaps closed; the others beside it, those that can be
+    read."""
+
+    def made(part: Part, **more: Any) -> Any:
+        whole, begin, closed = filled(part.on_grid(signal), found.rate, longest)
+        return make(whole, start=part.start + begin, notices=(*notices, *closed), **more)
+
+    others = []
+    for part in found.parts[1:]:
+        with contextlib.suppress(ValueError):
+            others.append(made(part))
+    return made(found.parts[0], others=others)
 
 
 def recording_of(
     make: Callable[..., Any], table: Table, reading: Reading, name: str | None = None
 ) -> Any:
     """What `make`, the class of a recording, makes of a column, called `name` or as its file."""
-    column, rate, units, axis, reference, time, max_gap, lever_arm = reading
+    column, _, units, axis, reference, time, max_gap, lever_arm, _ = reading
     require(axis in (None, *AXES, "principal"), "axis", axis, "choose one of x, y, z, principal")
-    require(
-        isinstance(max_gap, int | float) and 0 <= max_gap < math.inf,
-        "max_gap",
-        max_gap,
-        "give a time in s",
-    )
     times = clock(table, time)
     chosen = _chosen(table, column, axis, reference, None if times is None else times.name)
     times = clock(table, time, chosen.columns[0]) if table.clocks else times
     signal = values(table, chosen.columns)
     if reference is not None:
         signal = signal - values(table, _reference(table, reference, axis, signal.shape))
-    found, notices = sampling(table, chosen.columns[0], times, signal.shape[0], rate)
-    notices = [*table.notices, *([chosen.told] if chosen.told else []), *notices]
+    found, signal = _sampled(table, signal, chosen.columns[0], times, reading)
+    notices = [*table.notices, *([chosen.told] if chosen.told else []), *found.notices]
     unit = _unit(table, chosen, units, axis, notices)
     if lever_arm is not None:
         signal, unit = _as_force(table, chosen.name, signal, unit, lever_arm, notices)
@@ -69,19 +109,20 @@ def recording_of(
         Path(table.file).name,
         f"column {chosen.name}" if axis is None else f"point {chosen.name}, axis {axis}",
     ]
-    words += [f"minus {reference}"] * (reference is not None) + [f"{found:.6g} Hz"]
-    try:
-        whole, start, closed = filled(signal, found, float(max_gap))
-        samples = whole[:, 0] if whole.shape[1] == 1 else _principal(whole)
+    words += [f"minus {reference}"] * (reference is not None) + [f"{found.rate:.6g} Hz"]
+
+    def made(whole: np.ndarray, **more: Any) -> Any:
         return make(
-            samples,
-            found,
+            whole[:, 0] if whole.shape[1] == 1 else _principal(whole),
+            found.rate,
             unit=unit,
             name=name or table.name,
             source=printable(", ".join(words)),
-            start=start,
-            notices=(*notices, *closed),
+            **more,
         )
+
+    try:
+        return _of_parts(made, found, signal, float(max_gap), notices)
     except ValueError as error:
         raise ValueError(f"{table.file}: column {chosen.name}: {error}") from None
 
@@ -112,7 +153,8 @@ def perturbed_of(
             f" {fault}"
         )
     signal = values(table, names.values())
-    found, notices = sampling(table, force, times, signal.shape[0], reading.rate)
+    found, signal = _sampled(table, signal, force, times, reading)
+    notices = list(found.notices)
     units = _unit(table, _Choice(force, [force]), reading.units, None, notices)
     moved = table.units.get(displacement) if displacement_units is None else displacement_units
     if moved is None:
@@ -122,20 +164,22 @@ def perturbed_of(
             " insertion, the force alone, as `column`"
         )
     notices = [*table.notices, *notices]
-    source = f"{Path(table.file).name}, columns {force} and {displacement}, {found:.6g} Hz"
-    try:
-        whole, start, closed = filled(signal, found, float(reading.max_gap))
+    source = f"{Path(table.file).name}, columns {force} and {displacement}, {found.rate:.6g} Hz"
+
+    def made(whole: np.ndarray, **more: Any) -> Any:
         return make(
             *whole.T,
-            found,
+            found.rate,
             units=units,
             displacement_units=moved,
             name=table.name,
-            start=start,
             source=printable(source),
-            notices=(*notices, *closed),
             **options,
+            **more,
         )
+
+    try:
+        return _of_parts(made, found, signal, float(reading.max_gap), notices)
     except ValueError as error:
         raise ValueError(f"{table.file}: {error}") from None
 

@@ -51,6 +51,7 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
     skip_rows: int = 0,
     sheet: str | int | None = None,
     max_gap: float | int = 0.2,
+    outliers: str = "keep",
     displacement_units: str | None = None,
     lever_arm: float | int | None = None,
     positive: str | None = None,
@@ -68,8 +69,9 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
     column of a table, **counted from 0** as in `Data[:, 74]`. C3D: points, and analog channels.
 
     The time is a column called time, t, Zeit ..., one with a unit of time, one of clock times
-    (`10:00:00.001`, with a date or without), or a first one that rises evenly. It gives the rate,
-    has to be even, and counts from its first row.
+    (`10:00:00.001`, with a date or without), or a first one that rises nearly evenly. It gives the
+    rate and counts from its first row. Uneven times are brought to even ones, missing rows are
+    gaps, and at a pause the recording is cut, each with a notice.
 
     Points have three columns, as `finger_x, finger_y, finger_z` or `finger:0` to `finger:2`.
     `axis="principal"` is the direction in which the point, minus reference, moves most; it is
@@ -88,11 +90,15 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
       a torque with a `lever_arm`.
     - `axis`: which coordinate of the point `column`: x, y, z or principal.
     - `reference`: a column or point to subtract (finger minus stand).
-    - `time`: the column that holds the time, if it is not found by itself.
+    - `time`: the column that holds the time, if it is not found by itself; `"none"` leaves the
+      times out: the rows are even at `rate`.
     - `skip_rows`: lines of a text, or rows of a sheet, to leave out at the top.
     - `sheet`: of a workbook, its name or number from 0; needed if several hold a signal.
-    - `max_gap` [s]: gaps (NaN, empty, C3D residual below 0) up to this long are closed by straight
-      lines, with a notice.
+    - `max_gap` [s]: gaps (NaN, empty, missing rows, C3D residual below 0) up to this long are
+      closed by straight lines, with a notice. Where rows are missing for longer, the recording is
+      cut.
+    - `outliers`: samples that cannot be (marks as -9999, single spikes) are named in a notice and
+      kept (`"keep"`), or count as gaps (`"mask"`).
     - `displacement_units`: m, cm, mm, um, deg or rad; by default what the file states. `units` is
       that of the force.
     - `lever_arm` [m]: from the joint's axis to the point where the force acts. A torque is divided
@@ -103,7 +109,7 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
     **Raises:** `ValueError` naming file, line or argument, and the remedy; `ImportError` that says
     what to install.
     """
-    reading = Reading(column, rate, units, axis, reference, time, max_gap, lever_arm)
+    reading = Reading(column, rate, units, axis, reference, time, max_gap, lever_arm, outliers)
     options = {"displacement_units": displacement_units, "positive": positive, "delay": delay}
     if force is None or displacement is None:
         given = {"force": force, "displacement": displacement, **options, "delay": delay or None}

@@ -77,12 +77,19 @@ class ReadingTable(Table, kw_only=True):
     time: Annotated[
         str | int | None,
         says(
-            "Column of the time",
+            "Column of the time; none leaves the times out",
             missing="found by its name or unit; or a first column that rises evenly",
         ),
     ] = None
     max_gap: Annotated[
         Annotated[float, Meta(ge=0)] | None, says("Longest gap that is closed [s]", missing="0.2")
+    ] = None
+    outliers: Annotated[
+        Literal["keep", "mask"] | None,
+        says(
+            "Samples that cannot be, as -9999 or single spikes: `keep` or `mask` (as gaps)",
+            missing="keep",
+        ),
     ] = None
     lever_arm: Annotated[
         Above0 | None,

@@ -157,6 +157,7 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
     skip_rows: int = 0,
     sheet: str | int | None = None,
     max_gap: float | int = 0.2,
+    outliers: str = "keep",
     lever_arm: float | int | None = None,
 ) -> Trials:
     """Load the trials of one person in one condition.
@@ -170,8 +171,8 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
     - `columns`: which columns of this one file are trials (by default all with numbers but the
       time)
     - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `sheet`, `max_gap`,
-      `lever_arm`: as in `load_recording`, the same for all files. Several sheets of one layout in
-      a workbook are trials, unless `sheet` names one
+      `outliers`, `lever_arm`: as in `load_recording`, the same for all files. Several sheets of one
+      layout in a workbook are trials, unless `sheet` names one
 
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does,
     and for different units.
@@ -183,6 +184,7 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
         "reference": reference,
         "time": time,
         "max_gap": max_gap,
+        "outliers": outliers,
         "lever_arm": lever_arm,
     }
     if isinstance(paths, str | os.PathLike | Table):

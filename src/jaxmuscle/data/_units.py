@@ -76,11 +76,12 @@ _SECONDS = {
     3600.0: "h hr hours",
     1e-3: "ms msec msecs millisec milliseconds",
     1e-6: "us µs usec",
+    1e-9: "ns nsec nanoseconds",
 }
 SECONDS = {name: scale for scale, names in _SECONDS.items() for name in names.split()}
 _BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*")
 _SUFFIX = re.compile(
-    r"(.+?)(?:_|\s*/\s*)(N|mN|kN|kgf?|gf|lbf|lbs?|pctMVC|Nm|Ncm|Nmm|m|cm|mm|um|µm|V|mV|s|ms|us|deg|rad)\s*"
+    r"(.+?)(?:_|\s*/\s*)(N|mN|kN|kgf?|gf|lbf|lbs?|pctMVC|Nm|Ncm|Nmm|m|cm|mm|um|µm|V|mV|s|ms|us|ns|deg|rad)\s*"
 )
 
 

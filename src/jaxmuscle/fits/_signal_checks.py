@@ -13,6 +13,7 @@ from jaxmuscle._common.errors import SimulationError
 from jaxmuscle._common.text import probability
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._measured import RECORDED
+from jaxmuscle.data._recording import BURST
 from jaxmuscle.data._target import Target
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._resonant_noise import narrow_resonances
@@ -38,6 +39,7 @@ UNSURE, GONE = 0.05, 0.1  # p at which the muscle is simulated, and at which tha
 DRAWS = 399  # Gaussian records; of the nonlinear muscle
 RECORDS, BLOCK = 600, 2000.0  # s simulated at once
 CHANGES = "the size of the fluctuations changes during the record (bursts, pauses, fatigue)"
+EVENT = "where the force leaves its level, it fluctuates more than a steady muscle's"
 AT_ONCE = 4_000_000  # padded samples
 SUMS = 4999  # of several trials, of which each is drawn from the simulated ones
 LEAD, FORGOTTEN, LONGEST_LEAD = 5.0, 8.0, 20.0  # s; decay times before the record begins; s
@@ -101,7 +103,8 @@ def check_signals(target: Target, task: AbstractTask, key: Key) -> SignalTest:
             f" {float(noise.width):.2g} Hz wide, narrower than a bin ({resolution:.2g} Hz). {DO}"
             for noise in narrow_resonances(task.noise, resolution)
         )
-    steady = _steadiness(signals, task, density, key)
+    event = any(BURST in notice for notice in target.notices)
+    steady = _steadiness(signals, task, density, key, event=event)
     return steady._replace(notices=(*steady.notices, *sharp))
 
 
@@ -153,10 +156,10 @@ def _white_pool(n: int) -> _Pool:
 
 
 def _steadiness(
-    signals: list[np.ndarray], task: AbstractTask, density: Density, key: Key
+    signals: list[np.ndarray], task: AbstractTask, density: Density, key: Key, *, event: bool
 ) -> SignalTest:
-    """Whether the size of the fluctuations stays, first against Gaussian noise, then, where that is
-    doubtful, against the nonlinear muscle.
+    """Whether the size of the fluctuations stays (`event`: a cough is named already), first against
+    Gaussian noise, then, where that is doubtful, against the nonlinear muscle.
 
     That one's envelope varies more. It is simulated in blocks, until p is clearly above the level
     (sequential tests: Besag & Clifford 1991, doi:10.1093/biomet/78.2.301).
@@ -190,7 +193,7 @@ def _steadiness(
     ratio = max(1.0, here / expected)
     common = (ratio - 1) * expected / sum(lengths) ** 2
     found = SignalTest((), math.sqrt(ratio), common)
-    what = _trend(slope) if trend_p(parts) < LEVEL else CHANGES
+    what = _trend(slope) if trend_p(parts) < LEVEL else EVENT if event else CHANGES
     return found._replace(notices=(f"{what}, {probability(p)}. {_of_errors(found, len(signals))}",))
 
 

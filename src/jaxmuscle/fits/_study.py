@@ -433,6 +433,7 @@ def run_study(  # noqa: PLR0913 (options of a public call)
     skip_rows: int | None = None,
     sheet: str | int | None = None,
     max_gap: float | int | None = None,
+    outliers: str | None = None,
     lever_arm: float | int | None = None,
     spectrum: str | None = None,
     mvc: float | int | None = None,
@@ -473,8 +474,8 @@ def run_study(  # noqa: PLR0913 (options of a public call)
     - `progress`: True or a function of (text, share).
     - How files are read where a row does not say it: `window` (start, stop) [s] or "all" (by
       default the steady part); `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`,
-      `sheet`, `max_gap`, `lever_arm` as in `load_recording`; `spectrum`, a name of settings, the
-      same for all; `mvc` as in `Trials.target`.
+      `sheet`, `max_gap`, `outliers`, `lever_arm` as in `load_recording`; `spectrum`, a name of
+      settings, the same for all; `mvc` as in `Trials.target`.
 
     An option that is given here replaces that of the .toml; what a row says about its own file
     stays.
@@ -495,6 +496,7 @@ def run_study(  # noqa: PLR0913 (options of a public call)
         "skip_rows": skip_rows,
         "sheet": sheet,
         "max_gap": max_gap,
+        "outliers": outliers,
         "lever_arm": lever_arm,
         "spectrum": spectrum,
         "mvc": mvc,
