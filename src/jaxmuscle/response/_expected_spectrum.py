@@ -78,7 +78,7 @@ def expected_variation(
     their periods.
 
     **Arguments:** as of `expected_spectrum`; the `window` [s] also says how long the recording is
-    (10 s by default).
+    (10 s by default); `recorded_at` [Hz], whose aliases are in the variance.
 
     **Returns:** a fraction, not a percentage; differentiable, also under `jit` and `vmap`.
     **Raises** and warns as `expected_spectrum`.
