@@ -153,7 +153,7 @@ def read_with_holds(
         ]
     )
     for recording in held:
-        if recording.unit == "1":
+        if recording.unit == "a.u.":
             raise ValueError(
                 f"--hold {recording.name}: has no unit. Give --units N if all files are in newtons"
             )
@@ -223,13 +223,12 @@ def read_trials(
     (edges,) = windows_of(window, 1)
     options = {name: reading[name] for name in READING if name not in ("column", "reference")}
     trials = jm.load_recordings(table_of(paths[0], reading), **options)
-    return trials if edges == "all" else trials.steady(edges)
+    return trials.steady(edges)
 
 
 def read(table: "Table", reading: dict[str, Any], edges: Any) -> Any:
     """A recording, its steady part as window: the one that is given, `all`, or None to find it."""
-    recording = jm.load_recording(table, **reading)
-    return recording if edges == "all" else recording.steady(edges)
+    return jm.load_recording(table, **reading).steady(edges)
 
 
 def table_of(path: "str | Table", reading: dict[str, Any]) -> "Table":
