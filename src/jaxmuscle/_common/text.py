@@ -28,14 +28,21 @@ def rounded(value: float, error: float) -> tuple[str, str]:
     """A value and its error as they are printed: the error to two digits, the value to as many
     places."""
     if not (np.isfinite(value) and np.isfinite(error) and error > 0):
-        return f"{value:.3g}", f"{error:.2g}"
+        return digits(value), digits(error, 2)
     places = 1 - int(np.floor(np.log10(error)))
     if float(f"{error:.1e}") >= 10.0 ** (2 - places):  # 0.0996 is rounded up to 0.10
         places -= 1
     if not -4 <= places <= 7:
-        return f"{value:.3g}", f"{error:.2g}"
+        return digits(value), digits(error, 2)
     shown = [f"{round(x, places):.{max(places, 0)}f}" for x in (value, error)]
     return shown[0], shown[1]
+
+
+def digits(value: float, count: int = 3) -> str:
+    """A number with so many significant digits, and with all those before the point: 100, and not
+    1e+02."""
+    shown = f"{value:.{count}g}"
+    return f"{value:.0f}" if "e+" in shown and abs(value) < 1e9 else shown
 
 
 def squared(unit: str) -> str:

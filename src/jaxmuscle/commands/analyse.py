@@ -25,6 +25,7 @@ from .options import (
     Force,
     Formats,
     Json,
+    Mvc,
     Output,
     Recordings,
     SpectrumName,
@@ -44,6 +45,7 @@ from .recordings import (
 if TYPE_CHECKING:
     from jaxmuscle import PerturbedRecording, Trials
 
+FITTED = ("force", "torque", "displacement", "acceleration")
 VAGUE, MISSED = 0.05, 2.0  # s, standard error of a delay that is none; chi² over its expectation
 
 
@@ -63,16 +65,7 @@ def analyse(
             )
         ),
     ] = SpectrumName.standard,
-    mvc: Annotated[
-        float | None,
-        typer.Option(
-            metavar="FORCE",
-            help=(
-                "Maximal voluntary contraction, in the unit of the recording; gives the level in %"
-                " MVC."
-            ),
-        ),
-    ] = None,
+    mvc: Mvc = None,
     output: Output = Path("out"),
     formats: Formats = None,
     save_target: Annotated[
@@ -198,7 +191,8 @@ def _write(
         "spectrum": {key: values.tolist() for key, values in columns.items()},
     }
     target = None
-    if save_target is not None or ((several or mvc is not None) and trials[0].quantity is not None):
+    fits = trials[0].quantity in FITTED
+    if save_target is not None or ((several or mvc is not None) and fits):
         target = trials.target(
             None if save_target is None else save_target.stem, settings=settings, mvc=mvc
         )

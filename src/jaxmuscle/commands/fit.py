@@ -37,6 +37,7 @@ from .options import (
     Increments,
     Json,
     MethodName,
+    Mvc,
     Noise,
     NoiseName,
     Output,
@@ -63,6 +64,8 @@ from .signals import STAYS, interrupted, stays
 
 RUNGS = 3  # richer models that may be tried
 NOTHING = "nothing was written, the fit had no table yet"
+
+NO_MVC = "--mvc gives the level of recordings of a held force, and there are none: leave it out"
 
 
 @reads_perturbed
@@ -160,6 +163,7 @@ def fit(
     seed: Seed = 0,
     segments: Segments = None,
     quantity: Quantity = None,
+    mvc: Mvc = None,
     dataset: Annotated[
         str | None,
         typer.Option(
@@ -274,7 +278,7 @@ def fit(
         if several:
             from .cohort import fit_together
 
-            unused(reading, "axis", window=window, what="recordings; these are spectra")
+            unused(reading, "axis", "quantity", window=window, what="recordings; these are spectra")
             if everything:
                 raise ValueError("--all: of several spectra all numbers are in cohort.csv")
             if method != MethodName.linear or seeds is not None or increments is not None or quick:
@@ -291,6 +295,7 @@ def fit(
                 "--groups compares several spectra; to compare recordings of several people use"
                 " `jaxmuscle study`"
             )
+        _check_mvc(mvc, held=recorded and not hold)
         if recorded and (segments is not None or dataset is not None):
             raise ValueError(
                 "--segments and --dataset belong to spectra, and these are recordings: leave"
@@ -320,7 +325,9 @@ def fit(
             }
             options |= {"check_seeds": 0} if quick else {}
             seen, model = (
-                _aim_at_recordings(target, reading, window, task, quantity)
+                _aim_at_recordings(
+                    target, reading, window, task, {"quantity": quantity, "mvc": mvc}
+                )
                 if recorded
                 else _aim_at_spectrum(target[0], reading, window, task, read)
             )
@@ -330,6 +337,16 @@ def fit(
                 model = jm.on_rung(model, rung)
             converged = _fit_alone(seen, model, output, options, figures, everything=everything)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
+
+
+def _check_mvc(mvc: float | None, *, held: bool) -> None:
+    """Raise a `ValueError` for an --mvc that is none, or without recordings of a `held` force."""
+    from jaxmuscle._common.arguments import positive
+
+    if mvc is not None:
+        positive("--mvc", mvc)
+        if not held:
+            raise ValueError(NO_MVC)
 
 
 def _are_recordings(targets: list[str], holds: list[str] | None) -> bool:
@@ -392,13 +409,15 @@ def _aim_at_recordings(
     reading: dict[str, Any],
     window: str | None,
     task: TaskName | None,
-    quantity: str | None,
+    known: dict[str, Any],
 ) -> tuple[Any, Any]:
     """Perturbed recordings, or the target that others give, and the task to fit to it."""
     found = read_recordings(paths, reading, window, task)
     if isinstance(found, list):
+        if known["mvc"] is not None:
+            raise ValueError(NO_MVC)
         return found, jm.model.TASKS[task or "prescribed-length"]()
-    return aimed(found.target(quantity=quantity), task)
+    return aimed(found.target(**known), task)
 
 
 def _aim_at_spectrum(
@@ -410,10 +429,10 @@ def _aim_at_spectrum(
 ) -> tuple[Any, Any]:
     """The target of a spectrum or a frequency response, and the task to fit to it."""
     if not jm.data.is_frequency_response(name):
-        unused(reading, "axis", window=window, what="recordings; this is a spectrum")
+        unused(reading, "axis", "quantity", window=window, what="recordings; this is a spectrum")
         return aim_of(name, task, read)
     what = "recordings; this is a frequency response"
-    unused(reading, "axis", "lever_arm", window=window, what=what)
+    unused(reading, "axis", "lever_arm", "quantity", window=window, what=what)
     return aim_of(name, task, {"segments": read["segments"], "lever_arm": reading["lever_arm"]})
 
 

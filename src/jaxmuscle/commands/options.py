@@ -137,7 +137,18 @@ Segments = Annotated[
     ),
 ]
 Quantity = Annotated[
-    str | None, typer.Option(help="What was measured: force, torque, displacement or acceleration.")
+    str | None,
+    typer.Option(help="What was measured: force, torque, displacement, acceleration, ..."),
+]
+Mvc = Annotated[
+    float | None,
+    typer.Option(
+        metavar="FORCE",
+        help=(
+            "Maximal voluntary contraction, in the unit of the recording and counted from rest;"
+            " gives the level in % MVC."
+        ),
+    ),
 ]
 Window = Annotated[
     str | None,
@@ -223,6 +234,20 @@ _Arm = Annotated[
         ),
     ),
 ]
+_Baseline = Annotated[
+    str | None,
+    typer.Option(
+        metavar="A:B",
+        help=(
+            "Part in which the signal rests, from A to B in s: its mean is subtracted; or none. By"
+            " default it is found, and subtracted if it is quiet."
+        ),
+    ),
+]
+_Detrend = Annotated[
+    bool,
+    typer.Option("--detrend", help="Subtract the straight line through the part that is analysed."),
+]
 # how a recording is read: annotation and default of each option
 READING: dict[str, tuple[Any, Any]] = {
     "column": (_Name, None),
@@ -276,6 +301,9 @@ READING: dict[str, tuple[Any, Any]] = {
         ],
         "keep",
     ),
+    "quantity": (Quantity, None),
+    "baseline": (_Baseline, None),
+    "detrend": (_Detrend, False),
 }
 _Force = Annotated[
     str | None, typer.Option(metavar="NAME", help="For a moved insertion: the column of the force.")
@@ -321,7 +349,6 @@ SAME_NAME = (
     *PERTURBED,
     "force",
     "window",
-    "quantity",
     "segments",
 )  # arguments in messages that are options of the same name
 

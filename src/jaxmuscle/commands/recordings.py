@@ -153,7 +153,7 @@ def read_with_holds(
         ]
     )
     for recording in held:
-        if recording.unit == "1":
+        if recording.unit == "a.u.":
             raise ValueError(
                 f"--hold {recording.name}: has no unit. Give --units N if all files are in newtons"
             )
@@ -222,13 +222,12 @@ def read_trials(
     (edges,) = windows_of(window, 1)
     del options["column"], options["reference"]
     trials = jm.load_recordings(tables[0], **options)
-    return trials if edges == "all" else trials.steady(edges)
+    return trials.steady(edges)
 
 
 def read(table: "Table", reading: dict[str, Any], edges: Any) -> Any:
     """A recording, its steady part as window: the one that is given, `all`, or None to find it."""
-    recording = jm.load_recording(table, **reading)
-    return recording if edges == "all" else recording.steady(edges)
+    return jm.load_recording(table, **reading).steady(edges)
 
 
 def tables_of(paths: "Sequence[str | Table]", reading: dict[str, Any]) -> "list[Table]":

@@ -8,7 +8,7 @@ import typer
 import jaxmuscle as jm
 
 from .console import out, plain_lines, record, reporting, say_written, writable
-from .options import Force, Formats, Json, Output, Recordings, Window, band_of, formats_of
+from .options import Force, Formats, Json, Mvc, Output, Recordings, Window, band_of, formats_of
 from .recordings import read_trials, reads_recordings
 from .study import measured_study, write_study
 
@@ -28,6 +28,7 @@ def steadiness(
             ),
         ),
     ] = None,
+    mvc: Mvc = None,
     output: Output = Path("out"),
     formats: Formats = None,
     force: Force = False,
@@ -52,11 +53,17 @@ def steadiness(
         jaxmuscle steadiness study.csv --out out/study
     """
     with reporting(as_json):
+        if mvc is not None:
+            from jaxmuscle._common.arguments import positive
+
+            positive("--mvc", mvc)
         if len(paths) == 1 and jm.data.is_study(paths[0]):
             if band is not None:
                 raise ValueError(
                     "--band: of a study leave it out; the band is that of the quantity"
                 )
+            if mvc is not None:
+                raise ValueError("--mvc: of a study give the column mvc in its table")
             found = measured_study(paths[0], window, reading, output, force=force)
             write_study(found, output, formats_of(formats))
             return
@@ -73,7 +80,7 @@ def steadiness(
             force=force,
         )
         searched = None if band is None else band_of(band)
-        found = jm.steadiness(read_trials(paths, reading, window), band=searched)
+        found = jm.steadiness(read_trials(paths, reading, window), band=searched, mvc=mvc)
         found.save(output / "steadiness.json")
         write_text(output / "steadiness.csv", csv_of(found.to_dataframe()))
         figures = write_figure(found.plot(), output, "steadiness", formats_of(formats))

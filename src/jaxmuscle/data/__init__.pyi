@@ -8,6 +8,7 @@ from ._frequency_response_files import load_frequency_response as load_frequency
 from ._measure import Measure as Measure
 from ._perturbed import PerturbedRecording as PerturbedRecording
 from ._recording import Recording as Recording
+from ._recording_choice import Movement as Movement
 from ._recording_files import load_recording as load_recording
 from ._recording_files import read_table as read_table
 from ._recording_files import read_tables as read_tables
@@ -21,6 +22,5 @@ from ._target import Target as Target
 from ._target import load_target as load_target
 from ._trials import Trials as Trials
 from ._trials import load_recordings as load_recordings
-from ._two_channels import Movement as Movement
 from ._two_channels import movement as movement
 from ._two_channels import two_channels as two_channels

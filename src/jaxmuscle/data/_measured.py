@@ -22,15 +22,21 @@ AS_RECORDED: dict[str, Any] = {"filter_direction": "both", "sampling": "filtered
 RECORDED = SpectrumSettings(**AS_RECORDED)
 PARTS, SLOWEST = 4, 4  # parts of a recording; ordinates that say how sure its mean is
 # Hz, where a tremor is looked for; what moves shows it over a wider band than a held force
-TREMOR_BANDS = {"displacement": (3.0, 20.0), "acceleration": (3.0, 20.0)}
+# Quantities of what moves, whose mean is where the sensor lies, gravity or an offset.
+MOTIONS = ("displacement", "angle", "acceleration", "angular velocity")
+FLOATING = MOTIONS[2:]
+MOTION_BAND = (3.0, 20.0)
 TREMOR_BAND = (6.0, 12.0)
 LEVEL = 0.01  # of the test for a tremor
 RANGES = {name.removeprefix("band"): edges for name, edges in BANDS.items()} | {
     "_above_12": (12.0, math.inf)
 }
 FAST = 0.5  # Hz
+NARROWEST = 1.0  # Hz; a band in which a tremor can be seen
+SEEN = 0.9  # share of half the rate up to which the resampling leaves a spectrum as it is
 DRAWN = 200  # spectra, for errors where only the spectrum is known
 SIGNED = ("mean", "dfa_exponent")  # all else is 0 or more
+LEVEL_NAME = "level"
 MEAN, VARIATION, MEDIAN = "mean", "coefficient_of_variation", "median_frequency"
 REGULARITY = ("approximate_entropy", "sample_entropy", "dfa_exponent")
 Measures = dict[str, Measure]
@@ -53,7 +59,7 @@ MEASURES = (
 
 def tremor_band(quantity: str | None) -> tuple[float, float]:
     """The band [Hz] in which a tremor is looked for in a recording of this quantity."""
-    return TREMOR_BANDS.get(quantity or "", TREMOR_BAND)
+    return MOTION_BAND if quantity in MOTIONS else TREMOR_BAND
 
 
 def is_recorded(measures: Measures) -> bool:
@@ -73,16 +79,23 @@ def can_be_tested(target: Any, band: tuple[float, float]) -> bool:
 
 
 def measure_signals(
-    signals: Sequence[Float[np.ndarray, " _"]], unit: str, band: tuple[float, float]
+    signals: Sequence[Float[np.ndarray, " _"]],
+    unit: str,
+    quantity: str | None,
+    band: tuple[float, float] | None = None,
+    highest: float = math.inf,
 ) -> tuple[Iterator[Measures], Measures]:
     """The measures that `steadiness` lists, of each of several signals, whose tremor is looked for
     when they are asked for, and of all together.
 
     The signals are those of one person in one condition, sampled and low-passed as `RECORDED` says.
+    They hold nothing above `highest` [Hz]: bands that reach above it are left out, and no tremor is
+    looked for near it. The mean of what floats says nothing, and nothing is related to it.
     """
-    settings = _settings_for_band(band)
+    band = searched_band(quantity, highest) if band is None else band
+    settings = _settings_for_band(band, highest)
     segments = [_segments(x, settings) for x in signals]
-    own = [_own(x, unit) for x in signals]
+    own = [_own(x, unit, quantity, highest) for x in signals]
     each = (
         _stated(m | _measure_tremor([s], settings, band, m), 1, len(s))
         for m, s in zip(own, segments, strict=True)
@@ -92,7 +105,12 @@ def measure_signals(
     return each, _stated(together, len(signals), sum(map(len, segments)))
 
 
-def _own(x: Float[np.ndarray, " times"], unit: str) -> Measures:
+def _own(
+    x: Float[np.ndarray, " times"],
+    unit: str,
+    quantity: str | None = None,
+    highest: float = math.inf,
+) -> Measures:
     """The measures of one signal but the tremor."""
     rate = float(RECORDED.rate)
     f, power = variance_spectrum(x, rate)
@@ -108,11 +126,15 @@ def _own(x: Float[np.ndarray, " times"], unit: str) -> Measures:
         f"{VARIATION}_without_drift": _variation(level, mean, sure),
         f"{VARIATION}_above_{FAST:g}": _variation(power[f >= FAST], mean, sure),
     }
+    if quantity in FLOATING:
+        none = _measure(math.nan, math.nan, "1")
+        found |= {name: none for name in found if name.startswith(VARIATION)}
     varies, square = math.isfinite(found[VARIATION].value), mean**2
     relative, shares = {}, {}
     for name, (low, high) in RANGES.items():
         inside = (f >= low) & (f < high)
-        share = float(np.sum(power[inside])) / variance
+        shown = (high if math.isfinite(high) else low) <= highest
+        share = float(np.sum(power[inside])) / variance if shown else math.nan
         within, error = share * variance, _error(power * inside)
         found[f"power{name}"] = _measure(within, error, squared(unit))
         relative[f"relative_power{name}"] = (
@@ -240,10 +262,19 @@ def widen_errors(
     return {n: stated[n] if m is not measures[n] else m for n, m in wider.items()}
 
 
-def _settings_for_band(band: tuple[float, float]) -> SpectrumSettings:
+def searched_band(quantity: str | None, highest: float) -> tuple[float, float]:
+    """The band [Hz] in which a tremor is looked for in what holds nothing above `highest`."""
+    low, high = tremor_band(quantity)
+    high = min(high, SEEN * highest)
+    return low, high if high >= low + NARROWEST else low
+
+
+def _settings_for_band(band: tuple[float, float], highest: float = math.inf) -> SpectrumSettings:
     """Those of recordings, with the bins that say what is smooth about a band."""
     first, last = bins_around(band, RECORDED)
-    return SpectrumSettings(**AS_RECORDED, first_bin=first, last_bin=last)
+    seen = min(last, int(min(SEEN * highest / RECORDED.resolution, last)))
+    first = first if seen == last else max(1, int(first * seen / last))
+    return SpectrumSettings(**AS_RECORDED, first_bin=first, last_bin=max(seen, first))
 
 
 def _segments(
@@ -268,6 +299,15 @@ def _measure_tremor(
     groups, error_from = (segments, "trials") if many else ([*whole[:, None]], "segments")
     mean, varies = measures[MEAN], math.isfinite(measures[VARIATION].value)
     scale, unit = (1 / abs(mean.value), "1") if varies else (1.0, mean.unit)
+
+    if band[1] <= band[0]:
+        none = _measure(math.nan, math.nan, unit, error_from)
+        return {
+            "tremor_p": Measure(math.nan, None, "1", error_from),
+            "tremor_frequency": _measure(math.nan, math.nan, "Hz", error_from),
+            "tremor_size": none,
+            "tremor_detectable": none,
+        }
 
     def measured(power: Float[np.ndarray, " bins"]) -> tuple[float, float]:
         frequency, excess = measure_peak(power, settings, counts, band)

@@ -2,10 +2,10 @@
 
 import math
 
-from jaxmuscle._common.text import probability, rounded, squared
+from jaxmuscle._common.text import digits, probability, rounded, squared
 
 from ._measure import Measure
-from ._measured import FAST, MEAN, MEDIAN, RANGES, RECORDED, VARIATION, Measures
+from ._measured import FAST, LEVEL_NAME, MEAN, MEDIAN, RANGES, RECORDED, VARIATION, Measures
 
 CUT_OFF = RECORDED.filter_cutoff or math.inf  # Hz, of the low-pass before everything
 RELATIVE = "relative_power"
@@ -38,6 +38,8 @@ def measured_lines(measures: Measures, band: tuple[float, float]) -> list[str]:
     square = squared(measures[MEAN].unit).replace("^2", "²")
     lines = [f"{'':<{WIDE}}{'value ± standard error':<25} 95 % interval"]
     lines += [measured_line(words, name, measures[name]) for name, words in WORDS.items()]
+    if LEVEL_NAME in measures:
+        lines.insert(2, measured_line("  over the MVC", LEVEL_NAME, measures[LEVEL_NAME]))
     kinds = {
         RELATIVE if relative else "power": (
             "power by band, in millionths of the squared mean"
@@ -75,13 +77,15 @@ def range_words(low: float, high: float) -> str:
 
 def measured_line(words: str, name: str, m: Measure) -> str:
     """A measure with its error and interval; the ends have as many places as value and error."""
-    percent = name.startswith((VARIATION, "share")) or (name in TREMOR and m.unit == "1")
+    percent = name.startswith((VARIATION, LEVEL_NAME, "share")) or (
+        name in TREMOR and m.unit == "1"
+    )
     bare = m.unit == "1" or name.startswith("power")
     scale, unit = (
         (100.0, " %") if percent else (1.0, "" if bare else f" {m.unit.replace('^2', '²')}")
     )
     scale *= 1e6 if name.startswith(RELATIVE) else 1.0
-    said, ends = f"{scale * m.value:.3g}{unit}", ""
+    said, ends = f"{digits(scale * m.value)}{unit}", ""
     if math.isnan(m.value):
         said = "none"
     if m.stderr is not None and m.interval is not None:

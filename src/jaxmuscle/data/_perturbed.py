@@ -22,6 +22,7 @@ from jaxmuscle.spectra._settings import SpectrumSettings, require
 from ._frequency_response import FrequencyResponse
 from ._measure import Measure, normal_interval
 from ._recording import Recording, pooled_target, recorded_settings
+from ._recording_quality import Baseline
 from ._second_order import SecondOrder, lateness, lengthens, second_order_fit
 from ._target import Target
 from ._units import scale_to_si
@@ -162,6 +163,8 @@ class PerturbedRecording(Printed, eqx.Module):
         window: Sequence[float | int] | None = None,
         notices: Iterable[str] = (),
         others: Iterable["PerturbedRecording"] = (),
+        baseline: Baseline = None,
+        detrend: bool = False,
     ) -> "PerturbedRecording":
         """A recording from two arrays of one length; torque and angle are converted with the lever
         arm.
@@ -178,7 +181,8 @@ class PerturbedRecording(Printed, eqx.Module):
           with the other sign, that of the displacement is turned, and a notice says so.
         - `delay` [s]: by which the force channel lags behind the displacement channel; the
           displacement is shifted by it.
-        - `name`, `source`, `start`, `window`, `notices`, `others`: as in `Recording`.
+        - `name`, `source`, `start`, `window`, `notices`, `others`: as in `Recording`; `baseline`,
+          `detrend` too, of the force.
 
         **Raises:** `ValueError` naming the argument, its value and the remedy.
         """
@@ -209,7 +213,6 @@ class PerturbedRecording(Printed, eqx.Module):
                 f"displacement: constant at {reach * moved[0] + 0.0:g} m, so nothing moved the"
                 " muscle. Take the force alone, as a hold, or choose another column"
             )
-        negative = bool(np.mean(pull) < 0)
         pull, moved, begin, said = _shifted(scale * pull, reach * moved, float(rate), delay)
         fields: dict[str, Any] = {
             "name": name,
@@ -218,9 +221,12 @@ class PerturbedRecording(Printed, eqx.Module):
             "window": window,
         }
         held, given = (
-            _recording("force", pull, rate, "N", fields),
+            _recording(
+                "force", pull, rate, "N", fields | {"baseline": baseline, "detrend": detrend}
+            ),
             _recording("displacement", moved, rate, "m", fields),
         )
+        negative = bool(np.mean(held.whole) < 0)
         turn, more = _sign(held, given, positive)
         if negative:
             more = (
@@ -251,7 +257,7 @@ class PerturbedRecording(Printed, eqx.Module):
         """(start, stop) [s] of the part that is analysed, or `None` for all of it."""
         return self.force.window
 
-    def steady(self, window: Sequence[float | int] | None = None) -> "PerturbedRecording":
+    def steady(self, window: Sequence[float | int] | str | None = None) -> "PerturbedRecording":
         """The recording with the part as window in which the mean force is held: given, or found as
         by `Recording.steady`.
 
@@ -270,8 +276,9 @@ class PerturbedRecording(Printed, eqx.Module):
             if window is not None:
                 raise
             found = self._without_answer().steady()  # or it raises the same
-            held = self.force._with(self.force.whole, self.rate, found.window, found.notices)
-        moved = self.displacement.steady(held.window)
+            alone = self.force._with(self.force.whole, self.rate, None, found.notices)
+            held = alone.steady(found.window)
+        moved = self.displacement.steady("all" if held.window is None else held.window)
         return PerturbedRecording(
             held, moved, name=self.name, source=self.source, notices=self.notices
         )
@@ -710,6 +717,7 @@ def _ordinates(
         source=recording.source,
         start=recording.force.start,
         window=edges,
+        baseline="none",
         notices=(*recording.notices, *recording.late(), *cut, *linear, *said),
         recorded_at=recording.force.recorded_at,
     )

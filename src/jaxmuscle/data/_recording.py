@@ -4,7 +4,7 @@ target it gives."""
 import math
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
-from typing import Any
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
@@ -19,18 +19,29 @@ from jaxmuscle.spectra._measures import peaks, regularity
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
-from ._measured import AS_RECORDED, RECORDED, measure_signals, tremor_band
+from ._measured import AS_RECORDED, FLOATING, MOTIONS, RECORDED, measure_signals
 from ._recording_choice import Reading, recording_of
 from ._recording_outliers import OUTSIDE, Burst, find_bursts
-from ._recording_quality import RecordingSummary, checked, clipping, plateau, running_median
+from ._recording_quality import (
+    AT_REST,
+    Baseline,
+    RecordingSummary,
+    checked,
+    clipping,
+    find_rest,
+    plateau,
+    running_median,
+    without_rest,
+)
 from ._recording_table import frame_table
 from ._target import Target
 from ._target_fields import Quantity
 from ._units import UNITS, known_unit
 
-LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
+LOWEST_RATE = 10.0  # Hz; half of it lies above what is slow in a force
 SEGMENTS = 2  # a steady part holds at least this many
 SHORTEST = (RECORDED.length + (SEGMENTS - 1) * RECORDED.step) / RECORDED.rate  # s, which these take
+QUANTITIES = tuple(dict.fromkeys(quantity for quantity in UNITS.values() if quantity))
 DRIFT = 0.5  # share of the variance
 UNLIKE = 1.1  # ratio of the means of two trials
 UNRAMPED = "steady part: no ramp found, so all of the recording is used"
@@ -44,9 +55,16 @@ class Recording(Shown, eqx.Module):
     **Arguments:**
 
     - `samples`: the signal [`unit`], shape `(times,)`.
-    - `rate`: samples per second [Hz], at least 24, so that bin 30 lies below half of it.
-    - `unit`: N, mN, kN, kgf, gf, lbf, % MVC (force); N m, N cm, N mm (torque); m, cm, mm, um
-      (displacement); m/s^2, mm/s^2, g, mg (acceleration; g is 9.81 m/s^2); V, mV, a.u.
+    - `rate`: samples per second [Hz], at least 10; for a spectrum at least 24, so that bin 30 lies
+      below half of it.
+    - `unit`: N, mN, kN, kgf, gf, lbf, % MVC (force); N m, mN m, N cm, N mm, kgf m, lbf ft, lbf in
+      (torque); m, cm, mm, um (displacement); deg, rad (angle); m/s^2, mm/s^2, g, mg (acceleration;
+      g is 9.81 m/s^2); deg/s, rad/s (angular velocity); V, mV, uV, a.u.
+    - `quantity`: what was measured, if the unit (V, mV, uV, a.u.) does not say it.
+    - `baseline`: what is subtracted as the level at rest: the mean of a part (a, b) [s], or "none";
+      by default what `find_rest` finds, if it is quiet (`docs/recordings.md`, A sensor that is not
+      zero at rest).
+    - `detrend`: whether `steady` subtracts the straight line through the steady part.
     - `name`, `source`: how reports call it and where it comes from.
     - `start`: time of the first sample [s]; other than 0 if the file begins with a gap.
     - `window`: (start, stop) [s] of the part that is analysed, or all of it.
@@ -66,6 +84,8 @@ class Recording(Shown, eqx.Module):
     whole: Float[np.ndarray, " all"]
     rate: float = eqx.field(static=True)
     unit: str = eqx.field(static=True)
+    quantity: str | None = eqx.field(static=True)
+    detrend: bool = eqx.field(static=True)
     name: str = eqx.field(static=True)
     source: str = eqx.field(static=True)
     start: float = eqx.field(static=True)
@@ -80,6 +100,9 @@ class Recording(Shown, eqx.Module):
         rate: float | int,
         *,
         unit: str = "N",
+        quantity: str | None = None,
+        baseline: Baseline = None,
+        detrend: bool = False,
         name: str = "recording",
         source: str = "given by the user",
         start: float | int = 0.0,
@@ -92,11 +115,22 @@ class Recording(Shown, eqx.Module):
         self.recorded_at = self.rate if recorded_at is None else _rate(recorded_at)
         spelled = known_unit(unit)
         require(spelled is not None, "unit", unit, choices(unit, UNITS))
-        self.unit = str(spelled)
-        self.whole = checked(samples, self.rate, self.start)
+        self.unit, self.detrend = str(spelled), detrend
+        measured, known = UNITS[self.unit], choices(str(quantity), QUANTITIES)
+        require(quantity in UNITS.values(), "quantity", quantity, known)
+        remedy = f"the unit {unit} is that of another quantity ({measured}); give `units`"
+        fits = None in (quantity, measured) or quantity == measured
+        require(fits, "quantity", quantity, remedy)
+        self.quantity = measured or quantity
+        given = checked(samples, self.rate, self.start)
         self.others, notices = tuple(others), tuple(notices)
         marked = any(OUTSIDE in notice for notice in notices)
-        own = [] if marked else clipping(self.whole, self.rate, self.start)
+        own = [] if marked else clipping(given, self.rate, self.start)
+        if baseline is None and self.quantity in MOTIONS:
+            baseline = "none"
+        self.whole, said = without_rest(given, self.rate, self.start, self.unit, baseline)
+        self.whole.setflags(write=False)
+        own.extend(said)
         if self.rate < RECORDED.rate:
             own.append(f"recorded at {self.rate:g} Hz: holds nothing above {self.rate / 2:g} Hz")
         self.notices = tuple(dict.fromkeys((*notices, *own)))
@@ -116,6 +150,9 @@ class Recording(Shown, eqx.Module):
         max_gap: float | int = 0.2,
         lever_arm: float | int | None = None,
         outliers: str = "keep",
+        quantity: str | None = None,
+        baseline: Baseline = None,
+        detrend: bool = False,
         name: str = "recording",
     ) -> "Recording":
         """A recording from a pandas table, by the rules for tables in files.
@@ -126,7 +163,20 @@ class Recording(Shown, eqx.Module):
 
         **Raises:** `ValueError` naming column, row or argument, and the remedy.
         """
-        reading = Reading(column, rate, units, axis, reference, time, max_gap, lever_arm, outliers)
+        reading = Reading(
+            column,
+            rate,
+            units,
+            axis,
+            reference,
+            time,
+            max_gap,
+            lever_arm,
+            outliers,
+            quantity,
+            baseline,
+            detrend,
+        )
         return recording_of(cls, frame_table(frame), reading, name)
 
     @classmethod
@@ -137,6 +187,9 @@ class Recording(Shown, eqx.Module):
         *,
         column: int = 0,
         unit: str = "N",
+        quantity: str | None = None,
+        baseline: Baseline = None,
+        detrend: bool = False,
         name: str = "recording",
         source: str = "given by the user",
         start: float | int = 0.0,
@@ -166,6 +219,9 @@ class Recording(Shown, eqx.Module):
             array,
             rate,
             unit=unit,
+            quantity=quantity,
+            baseline=baseline,
+            detrend=detrend,
             name=name,
             source=source,
             start=start,
@@ -202,11 +258,12 @@ class Recording(Shown, eqx.Module):
         a, b = (self.start, self.stop) if self.window is None else self.window
         return max(round((a - self.start) * rate), 0), round((b - self.start) * rate)
 
-    def _with(self, samples: Any, rate: float, window: Any, notices: Iterable[str]) -> "Recording":
-        fields = {
-            key: getattr(self, key) for key in ("unit", "name", "source", "start", "recorded_at")
-        }
-        return Recording(samples, rate, **fields, window=window, notices=notices)
+    def _with(
+        self, samples: Any, rate: float, window: Any, notices: Iterable[str], **changed: Any
+    ) -> "Recording":
+        kept = ("unit", "quantity", "detrend", "name", "source", "start", "recorded_at")
+        fields = {key: getattr(self, key) for key in kept} | changed
+        return Recording(samples, rate, **fields, baseline="none", window=window, notices=notices)
 
     @property
     def stop(self) -> float:
@@ -227,12 +284,6 @@ class Recording(Shown, eqx.Module):
     def duration(self) -> float:
         """Length of the window [s]."""
         return self.samples.size / self.rate
-
-    @property
-    def quantity(self) -> Quantity | None:
-        """What the unit measures: force, torque, displacement, acceleration, or `None` (V,
-        a.u.)."""
-        return UNITS[self.unit]
 
     def resampled(self, rate: float | int = 100.0) -> "Recording":
         """The recording at another rate: `scipy.signal.resample_poly`, which low-passes against
@@ -260,7 +311,7 @@ class Recording(Shown, eqx.Module):
         )
         return self._with(samples, rate, self.window, self.notices)
 
-    def steady(self, window: Sequence[float | int] | None = None) -> "Recording":
+    def steady(self, window: Sequence[float | int] | str | None = None) -> "Recording":
         """The recording with its steady part as window: the one that is given, or the plateau of a
         ramp-and-hold.
 
@@ -270,13 +321,18 @@ class Recording(Shown, eqx.Module):
         median of what lies more than half-way from rest to peak. The plateau has to hold at least
         half of the time spent beyond half-way; one second is taken off at the ramps. Without a ramp
         (running median within a fifth of its largest value) all of it is steady. So is an
-        acceleration, which holds no level.
+        acceleration or an angular velocity, which holds no level.
 
-        **Arguments:** `window` (start, stop) [s], in the recording's own time.
+        With `detrend` the straight line through the window is subtracted from the recording, and
+        its mean in the window kept.
+
+        **Arguments:** `window` (start, stop) [s], in the recording's own time, or "all".
 
         **Raises:** `ValueError` if no plateau is found, and if the window is shorter than two Welch
         segments (3.84 s).
         """
+        if isinstance(window, str) and window == "all":
+            return self._straight()
         for part in self.others if window is not None else ():
             if part.holds(window):
                 return part.steady(window)
@@ -286,15 +342,16 @@ class Recording(Shown, eqx.Module):
         if window is None:
             even = self.resampled(RECORDED.rate)
             everything = (0, even.whole.size)
-            found = (
-                everything if self.quantity == "acceleration" else plateau(even.whole, even.rate)
-            )
+            rest = None if self.quantity in FLOATING else find_rest(even.whole, even.rate)
+            above = even.whole - (rest.level if rest is not None and rest.quiet else 0.0)
+            found = everything if self.quantity in FLOATING else plateau(above, even.rate)
             if found is None:
+                resting = "".join(f". {said}" for said in notices if said.startswith(AT_REST))
                 raise ValueError(
                     f"{self.name}: no steady part was found: the signal must stay within 10 % of"
                     " one level for at least half of the time under load, and longer than 2 s. Is"
                     " it the right column? Then give the part yourself: --window a:b (in Python"
-                    f" steady((a, b))), between {self.start:g} and {self.stop:g} s"
+                    f" steady((a, b))), between {self.start:g} and {self.stop:g} s" + resting
                 )
             window = (
                 self.start + found[0] / even.rate,
@@ -320,7 +377,21 @@ class Recording(Shown, eqx.Module):
                 f" {SHORTEST:g} s"
             )
             raise ValueError(f"{self.name}: {what} {words}")
-        return part
+        return part._straight()
+
+    def _straight(self) -> "Recording":
+        """The recording without the straight line through its window, if it is to be so; with the
+        mean that it has there."""
+        if not self.detrend:
+            return self
+        slope = float(np.polyfit(self.time, self.samples, 1)[0])
+        every = self.start + np.arange(self.whole.size) / self.rate
+        level = self.whole - slope * (every - np.mean(self.time))
+        said = (
+            f"the straight line through {self.window_in_words} was subtracted and the mean kept:"
+            f" {slope:.3g} {self.unit} in 1 s, {slope * self.duration:.3g} {self.unit} in all"
+        )
+        return self._with(level, self.rate, self.window, (*self.notices, said), detrend=False)
 
     def segments(self, settings: SpectrumSettings | str | None = None) -> int:
         """Number of whole Welch segments in the window."""
@@ -350,7 +421,11 @@ class Recording(Shown, eqx.Module):
         """
         settings = recorded_settings(settings)
         highest = float(settings.frequency[-1])
-        remedy = f"half of it lies below the last bin, {highest:g} Hz; choose a lower last_bin"
+        remedy = (
+            f"half of it lies below the last bin, {highest:g} Hz, of a spectrum. `jaxmuscle"
+            " steadiness` takes this recording; for its spectrum record faster, or choose a lower"
+            " last_bin in the settings"
+        )
         require(highest < self.rate / 2, "rate", self.rate, remedy)
         self._require_change()
         even = self.resampled(settings.rate)
@@ -393,14 +468,17 @@ class Recording(Shown, eqx.Module):
         x = self.filtered(settings)
         mean, deviation = float(np.mean(x)), float(np.std(x))
         approximate, sample = regularity(x)
+        varies = deviation / abs(mean) if mean else math.inf
+        # what is near zero says so itself
+        floats = self.quantity in FLOATING and varies < 10
         return RecordingSummary(
             unit=self.unit,
             duration=x.size / settings.rate,
             segments=self.segments(settings),
             mean=mean,
             standard_deviation=deviation,
-            coefficient_of_variation=deviation / abs(mean) if mean else math.inf,
-            signal_to_noise=mean / deviation,
+            coefficient_of_variation=math.nan if floats else varies,
+            signal_to_noise=math.nan if floats else mean / deviation,
             approximate_entropy=approximate,
             sample_entropy=sample,
             peaks=peaks(self.spectrum(settings)),
@@ -484,8 +562,8 @@ def _rate(rate: Any) -> float:
     )
     require(number and rate > 0, "rate", rate, "give samples per second [Hz], above 0")
     remedy = (
-        f"too slow: half of it lies below the last bin, 11.72 Hz; record at {LOWEST_RATE:g} Hz or"
-        " more"
+        f"too slow: half of it lies below what is to be seen of a force; record at {LOWEST_RATE:g}"
+        " Hz or more"
     )
     require(rate >= LOWEST_RATE, "rate", rate, remedy)
     return float(rate)
@@ -506,6 +584,12 @@ def pooled_target(
         raise ValueError(
             f"`quantity`: the unit {unit} does not say what was measured. If it is a force, give"
             " `quantity`, as quantity=force; an EMG cannot be fitted. Is it the right column?"
+        )
+    if quantity not in get_args(Quantity):
+        article = "an" if quantity[0] in "aeiou" else "a"
+        raise ValueError(
+            f"`quantity`: {article} {quantity} cannot be fitted, no task of the model has one as"
+            " its output. `jaxmuscle steadiness` and `jaxmuscle analyse` take it"
         )
     rows = np.stack([np.asarray(recording.spectrum(settings).power) for recording in recordings])
     segments = [recording.segments(settings) for recording in recordings]
@@ -545,7 +629,7 @@ def pooled_target(
         recorded_at=_rate_of_all(recordings, segments),
         trial_power=rows if len(rows) > 1 else None,
         settings=settings,
-        measured=measure_signals(held, unit, tremor_band(quantity))[1],
+        measured=measure_signals(held, unit, quantity)[1],
         signals=held,
         notices=notices_of(recordings, signals, settings.rate, drifts, quantity),
     )
@@ -673,7 +757,7 @@ def _drift(x: Float[np.ndarray, " times"]) -> tuple[str, ...]:
         (
             f"a straight drift makes {100 * (1 - (after / before) ** 2):.0f} % of the variance. The"
             f" coefficient of variation is {before / mean:.3g} with the drift, {after / mean:.3g}"
-            " without. The model has no drift: remove it first (scipy.signal.detrend, and add the"
-            " mean), or choose a steadier window"
+            " without. The model has no drift: --detrend (Python: detrend=True) subtracts it;"
+            " or choose a steadier window"
         ),
     )

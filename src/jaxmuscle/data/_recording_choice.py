@@ -14,15 +14,43 @@ from jaxmuscle._common.text import choices, printable
 from jaxmuscle.spectra._settings import require
 
 from ._recording_outliers import OUTLIERS, find_outliers
-from ._recording_quality import filled
-from ._recording_table import AXES, Table, bare, find, listed, points, triple, values
+from ._recording_quality import Baseline, filled
+from ._recording_table import AXES, Table, bare, find, listed, measured_in, points, triple, values
 from ._recording_time import Clock, Part, Sampling, clock, sampling
-from ._units import UNITS, known_unit, quantity_of, scale_to_si
+from ._units import (
+    SCALELESS,
+    UNITS,
+    known_unit,
+    named_quantity,
+    quantity_of,
+    scale_to_si,
+    units_for,
+)
 
 # what a column of force is called, by decomposition programs the signal of reference
 FORCE = re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?|ref_?signal")
-
+UNSCALED = (
+    "no unit stated: numbers are relative to the mean, and nothing is in newtons. If it is in N,"
+    ' give --units N (Python: units="N")'
+)
+MEASURED = {"force": ("force", "torque"), "displacement": ("displacement", "angle")}
+# Standard deviations below which the insertion was held: it moves no force that one could see. In
+# mm, and in degrees.
+STILL = {"mm": 0.03, "deg": 0.1}
 _NUMBER = re.compile(r" \d+$")  # of columns of one name
+
+
+class Movement(NamedTuple):
+    """By how much the insertion moves: standard deviation `size` in `unit`. It `rests` if that is
+    as good as nothing."""
+
+    size: float
+    unit: str
+    rests: bool
+
+    def __str__(self) -> str:
+        # rounding error is no movement
+        return f"{round(self.size, 9):.3g} {self.unit}".rstrip() + " rms"
 
 
 class _Choice(NamedTuple):
@@ -43,6 +71,9 @@ class Reading(NamedTuple):
     max_gap: float | int = 0.2
     lever_arm: float | int | None = None
     outliers: str = "keep"
+    quantity: str | None = None
+    baseline: Baseline = None
+    detrend: bool = False
 
 
 def _sampled(
@@ -92,19 +123,20 @@ def recording_of(
     make: Callable[..., Any], table: Table, reading: Reading, name: str | None = None
 ) -> Any:
     """What `make`, the class of a recording, makes of a column, called `name` or as its file."""
-    column, _, units, axis, reference, time, max_gap, lever_arm, _ = reading
+    column, axis, reference = reading.column, reading.axis, reading.reference
     require(axis in (None, *AXES, "principal"), "axis", axis, "choose one of x, y, z, principal")
-    times = clock(table, time)
+    times = clock(table, reading.time)
     chosen = _chosen(table, column, axis, reference, None if times is None else times.name)
-    times = clock(table, time, chosen.columns[0]) if table.clocks else times
+    times = clock(table, reading.time, chosen.columns[0]) if table.clocks else times
     signal = values(table, chosen.columns)
     if reference is not None:
         signal = signal - values(table, _reference(table, reference, axis, signal.shape))
     found, signal = _sampled(table, signal, chosen.columns[0], times, reading)
     notices = [*table.notices, *([chosen.told] if chosen.told else []), *found.notices]
-    unit = _unit(table, chosen, units, axis, notices)
-    if lever_arm is not None:
-        signal, unit = _as_force(table, chosen.name, signal, unit, lever_arm, notices)
+    unit, quantity = _unit(table, chosen, reading, notices)
+    if reading.lever_arm is not None:
+        signal, unit = _as_force(table, chosen.name, signal, unit, reading.lever_arm, notices)
+        quantity = None
     words = [
         Path(table.file).name,
         f"column {chosen.name}" if axis is None else f"point {chosen.name}, axis {axis}",
@@ -116,13 +148,16 @@ def recording_of(
             whole[:, 0] if whole.shape[1] == 1 else _principal(whole),
             found.rate,
             unit=unit,
+            quantity=quantity,
+            baseline=reading.baseline,
+            detrend=reading.detrend,
             name=name or table.name,
             source=printable(", ".join(words)),
             **more,
         )
 
     try:
-        return _of_parts(made, found, signal, float(max_gap), notices)
+        return _of_parts(made, found, signal, float(reading.max_gap), notices)
     except ValueError as error:
         raise ValueError(f"{table.file}: column {chosen.name}: {error}") from None
 
@@ -155,7 +190,11 @@ def perturbed_of(
     signal = values(table, names.values())
     found, signal = _sampled(table, signal, force, times, reading)
     notices = list(found.notices)
-    units = _unit(table, _Choice(force, [force]), reading.units, None, notices)
+    units, _ = _unit(table, _Choice(force, [force]), reading, notices)
+    if units in SCALELESS:
+        raise ValueError(
+            f"{table.file}: does not say in which unit {force} is; give `units`, as units='N'"
+        )
     moved = table.units.get(displacement) if displacement_units is None else displacement_units
     if moved is None:
         raise ValueError(
@@ -172,6 +211,8 @@ def perturbed_of(
             found.rate,
             units=units,
             displacement_units=moved,
+            baseline=reading.baseline,
+            detrend=reading.detrend,
             name=table.name,
             source=printable(source),
             **options,
@@ -228,9 +269,7 @@ def _chosen(
     if reference is not None:
         others = [name for name in others if name != find(table, reference, "reference")]
     if len(others) > 1:
-        forces = [
-            name for name in others if quantity_of(table.units.get(name, "")) in ("force", "torque")
-        ]
+        forces = [name for name in others if measured_in(table, name) in ("force", "torque")]
         forces = (
             forces
             if len(forces) == 1
@@ -256,20 +295,39 @@ def _others(table: Table, time: str | None) -> list[str]:
     return [name for name in table.columns if name not in none]
 
 
+def movement_of(table: Table, name: str) -> Movement:
+    """How much a column moves in the middle half of a recording, see `movement`."""
+    samples = values(table, [name])[:, 0]
+    middle = samples[samples.size // 4 : samples.size - samples.size // 4]
+    size = float(np.std(middle[np.isfinite(middle)])) if np.isfinite(middle).any() else math.nan
+    unit, measured = table.units.get(name, ""), measured_in(table, name)
+    if measured not in MEASURED["displacement"]:
+        return Movement(size, unit, size == 0)
+    turned = measured == "angle"
+    scale, _ = scale_to_si(unit, "displacement_units", "displacement", 1.0)
+    size *= scale * (180 / math.pi if turned else 1e3)
+    shown = "deg" if turned else "mm"
+    return Movement(size, shown, size < STILL[shown])
+
+
 def _moved(table: Table, others: list[str], force: str) -> str:
     """What to say where a column is a displacement: the answer to a motor is no fluctuation of a
     hold."""
-    moving = [
-        name
-        for name in others
-        if quantity_of(table.units.get(name, "")) in ("displacement", "angle")
-    ]
-    if not moving:
+    moving = next(
+        (name for name in others if measured_in(table, name) in MEASURED["displacement"]), None
+    )
+    if moving is None:
         return ""
+    moves = movement_of(table, moving)
+    if moves.rests:
+        return f". {moving} rests: it moves by {moves}"
+    turned = {measured_in(table, name) for name in (force, moving)} & {"torque", "angle"}
+    arm = " --lever-arm METRES" if turned else ""
     return (
-        f". If a motor moved the muscle ({moving[0]}), give both channels: --force-column {force}"
-        f" --displacement {moving[0]} (Python: force=, displacement=). Else the answer to the motor"
-        " counts as unsteadiness"
+        f". {moving} moves by {moves}, so `jaxmuscle fit` takes it for a record of a moved"
+        " insertion. If a motor moved the muscle, give both channels: --force-column"
+        f" {force!r} --displacement {moving!r}{arm} (Python: force=, displacement=). Else the"
+        " answer to the motor counts as unsteadiness"
     )
 
 
@@ -321,28 +379,45 @@ def _reference(
 
 
 def _unit(
-    table: Table, chosen: _Choice, units: str | None, axis: str | None, notices: list[str]
-) -> str:
-    stated = table.units.get(chosen.columns[0])
-    if units is not None:
-        require(known_unit(units) is not None, "units", units, choices(units, UNITS))
-        if stated is not None and known_unit(stated) not in (None, known_unit(units)):
-            notices.append(f"unit {units} as asked; the file says {stated}")
-        return units
-    if stated is not None and known_unit(stated) is not None:
-        return stated
-    if axis is not None:
-        raise ValueError(
-            f"{table.file}: does not say in which unit {chosen.name} is; give `units`, as"
-            " units='mm'"
-        )
-    if stated is not None:
-        raise ValueError(
-            f"{table.file}: column {chosen.name}: unknown unit {stated!r}; give `units`, as"
-            " units='N'"
-        )
-    notices.append("no unit stated: taken as N")
-    return "N"
+    table: Table, chosen: _Choice, reading: Reading, notices: list[str]
+) -> tuple[str, str | None]:
+    """The unit of a column, and what it measures: by the unit, else by the name; a column of
+    unknown unit whose name says nothing else is a force."""
+    name = chosen.columns[0]
+    stated, named = table.units.get(name), named_quantity(name)
+    asked = stated if reading.units is None else reading.units
+    unit = None if asked is None else known_unit(asked, name)
+    if reading.units is not None:
+        require(unit is not None, "units", reading.units, choices(reading.units, UNITS))
+        if stated is not None and known_unit(stated, name) not in (None, unit):
+            notices.append(f"unit {reading.units} as asked; the file says {stated}")
+    if unit is None and (stated or reading.axis or named not in (None, "force")):
+        raise ValueError(f"{table.file}: {_without_unit(chosen.name, stated, named, reading.axis)}")
+    if unit is None:
+        notices.append(UNSCALED)
+        meant = "force"
+    else:
+        meant = UNITS[unit] or (named if named in UNITS.values() else None)
+        if unit != known_unit(str(asked)):
+            notices.append(f"{asked} of {name} is taken as {unit}, since it is a {named}")
+    return unit or "a.u.", meant if reading.quantity is None else reading.quantity
+
+
+def _without_unit(name: str, stated: str | None, named: str | None, axis: str | None) -> str:
+    """What to say of a column whose unit is needed and not known."""
+    likely = units_for("displacement" if axis is not None and named is None else named)
+    fault = (
+        f"column {name}: unknown unit {stated!r}"
+        if stated is not None
+        else f"does not say in which unit {name} is"
+    )
+    relative = "units='a.u.' if numbers relative to the mean are enough"
+    if named is None and not likely:
+        return f"{fault}; give `units`, {relative}; {choices(stated, UNITS)}"
+    if not likely:
+        return f"{fault}; give `units`: of a {named} none is known here, so {relative}"
+    first, *others = (unit for unit in likely if unit not in SCALELESS)
+    return f"{fault}; give `units`, as units={first!r} (or {', '.join(others)}), or {relative}"
 
 
 def _principal(xyz: Float[np.ndarray, "times 3"]) -> Any:

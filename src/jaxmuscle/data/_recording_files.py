@@ -17,6 +17,7 @@ from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_choice import Reading, perturbed_of, recording_of, signals
 from ._recording_csv import read_csv
+from ._recording_quality import Baseline
 from ._recording_table import Table, channels_table, find
 from ._recording_time import clock
 from ._text_tables import LOOK, TEXT, holds_text
@@ -56,6 +57,9 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
     lever_arm: float | int | None = None,
     positive: str | None = None,
     delay: float | int = 0.0,
+    quantity: str | None = None,
+    baseline: Baseline = None,
+    detrend: bool = False,
 ) -> Recording | PerturbedRecording:
     """Load a recording from text, Excel, MATLAB, NumPy, C3D, EDF, TDMS, AcqKnowledge or Spike2
     files.
@@ -86,8 +90,8 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
     - `column`: name (case and unit may be left out) or number from 0; needed if there are several.
     - `force`, `displacement`: instead of `column`, the two channels of a perturbation experiment.
     - `rate` [Hz]: needed if the file does not state it.
-    - `units`: as in `Recording`; by default what the file states, else N. Nothing is converted but
-      a torque with a `lever_arm`.
+    - `units`: as in `Recording`; by default what the file or the column's name states. A force of
+      unknown unit is in a.u. Nothing is converted but a torque with a `lever_arm`.
     - `axis`: which coordinate of the point `column`: x, y, z or principal.
     - `reference`: a column or point to subtract (finger minus stand).
     - `time`: the column that holds the time, if it is not found by itself; `"none"` leaves the
@@ -105,11 +109,25 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
       by it and becomes a force in N; of two channels, an angle is multiplied by it and becomes a
       displacement.
     - `positive`, `delay` [s]: of two channels, see `PerturbedRecording.from_array`.
+    - `quantity`, `baseline`, `detrend`: as in `Recording`; `baseline` also as a text, "0:1".
 
     **Raises:** `ValueError` naming file, line or argument, and the remedy; `ImportError` that says
     what to install.
     """
-    reading = Reading(column, rate, units, axis, reference, time, max_gap, lever_arm, outliers)
+    reading = Reading(
+        column,
+        rate,
+        units,
+        axis,
+        reference,
+        time,
+        max_gap,
+        lever_arm,
+        outliers,
+        quantity,
+        baseline,
+        detrend,
+    )
     options = {"displacement_units": displacement_units, "positive": positive, "delay": delay}
     if force is None or displacement is None:
         given = {"force": force, "displacement": displacement, **options, "delay": delay or None}
@@ -121,7 +139,7 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
                 "belongs to recordings of two channels; give `force` and `displacement`",
             )
         return recording_of(Recording, read_table(path, skip_rows, sheet), reading)
-    for name in ("column", "axis", "reference"):
+    for name in ("column", "axis", "reference", "quantity"):
         value = getattr(reading, name)
         require(
             value is None, name, value, "leave it out: `force` and `displacement` name the columns"

@@ -1,7 +1,9 @@
 """The numbers of a recording: level, variability, regularity, spectral peaks."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -11,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from jaxmuscle._common.cards import Printed
 from jaxmuscle._common.files import nulled
 from jaxmuscle._common.tables import frame
+from jaxmuscle._common.text import digits
 from jaxmuscle.spectra._measures import Peaks
 from jaxmuscle.spectra._settings import require
 
@@ -45,17 +48,24 @@ class RecordingSummary(Printed, eqx.Module):
         return [
             ("window (s)", f"{self.duration:.2f}"),
             ("Welch segments", f"{self.segments}"),
-            (f"mean ({self.unit})", f"{self.mean:.4g}"),
-            (f"standard deviation ({self.unit})", f"{self.standard_deviation:.4g}"),
+            (f"mean ({self.unit})", digits(self.mean, 4)),
+            (f"standard deviation ({self.unit})", digits(self.standard_deviation, 4)),
             (
                 "coefficient of variation (%)",
-                f"{100 * variation:.3g}" if variation < 10 else "none, the mean is near zero",
+                "none, the mean is gravity or offset"
+                if math.isnan(variation)
+                else digits(100 * variation)
+                if variation < 10
+                else "none, the mean is near zero",
             ),
-            ("mean over SD (signal-to-noise)", f"{self.signal_to_noise:.4g}"),
+            (
+                "mean over SD (signal-to-noise)",
+                "none" if math.isnan(variation) else digits(self.signal_to_noise, 4),
+            ),
             ("approximate entropy", f"{self.approximate_entropy:.4f}"),
             ("sample entropy", f"{self.sample_entropy:.4f}"),
             ("maximum of the spectrum (Hz)", f"{top.interpolated:.3f}"),
-            ("power in its bin (%)", f"{100 * top.power:.3g}"),
+            ("power in its bin (%)", digits(100 * top.power)),
             ("local maxima (Hz)", local),
         ]
 
@@ -92,6 +102,17 @@ class RecordingSummary(Printed, eqx.Module):
 # A flat run at an extreme counts as clipped from this long on [s], and from this many samples on.
 FLAT = (0.02, 5)
 RAMP, BAND, SHARE, SMOOTH = 0.2, 0.1, 0.5, 1.0
+# Of rest: the least time [s] that shows it; how far, over the height of the ramp, it goes before it
+# is left; the share of it that is looked at, away from the ramp.
+SHORT, LEFT, KEPT = 0.3, 0.05, 0.75
+# It is subtracted if it scatters by less than this times the hold, and both ends agree within that
+# much of the height. Below that share of the height, or that many of its deviations, it is zero.
+QUIET, AGREE, NOTHING, NOISE = 0.1, 0.02, 0.01, 2.0
+
+AT_REST = "at rest "
+MAINS = 50.0  # Hz
+
+Baseline = str | Sequence[float | int] | None
 
 
 def runs(mask: Bool[np.ndarray, " times"]) -> Int[np.ndarray, "runs 2"]:
@@ -153,8 +174,8 @@ def clipping(x: Float[np.ndarray, " times"], rate: float, start: float) -> list[
             share = np.mean(x == extreme)
             first = start + flat[0, 0] / rate
             notices.append(
-                f"flat at its {word} value {extreme:.6g} for {100 * share:.2g} % of the samples,"
-                f" first at {first:.3f} s: clipped by the amplifier?"
+                f"flat at its {word} value {extreme:.6g} for {digits(100 * share, 2)} % of the"
+                f" samples, first at {first:.3f} s: clipped by the amplifier?"
             )
     return notices
 
@@ -196,6 +217,158 @@ def plateau(x: Float[np.ndarray, " times"], rate: float) -> tuple[int, int] | No
         return None
     start, stop = start + size * (start > 0), stop - size * (stop < x.size)
     return (start, stop) if stop > start else None
+
+
+class _Rest(NamedTuple):
+    """A level at an end of a signal, before the first ramp or after the last: from `begin` to `end`
+    [s after the first sample]; its `scatter` is a standard deviation."""
+
+    level: float
+    scatter: float
+    begin: float
+    end: float
+
+
+class Rest(NamedTuple):
+    """The level of a signal at rest, and how much it scatters there, over the scatter of the hold.
+    `begin`, `end` [s after the first sample]; `zero`, whether it is as good as none;
+    `agree`, whether it is the same before and after; `likely`, whether it is on both sides, or
+    nearer to zero than the hold."""
+
+    level: float
+    share: float
+    begin: float
+    end: float
+    zero: bool
+    agree: bool
+    likely: bool
+
+    @property
+    def quiet(self) -> bool:
+        """Whether only the sensor is seen there, and no person."""
+        return self.share < QUIET and self.agree
+
+
+def find_rest(x: Float[np.ndarray, " times"], rate: float) -> Rest | None:
+    """Where a signal rests before its first ramp or after its last one; `None` where it has none.
+
+    A stretch at an end is a candidate if the signal, smoothed over 0.1 s, leaves its level by 5 %
+    of the height of the signal; the quarter next to the ramp is not looked at. Of two candidates
+    the one that scatters less is rest, and the other one too if it has the same level within a
+    tenth of the height. All is averaged over 20 ms, in which mains hum vanishes. The hold is the
+    `plateau` above that level; without one its scatter is the median of that in pieces of 1 s more
+    than half-way to the peak.
+    """
+    k = max(round(rate / MAINS), 1)
+    even, rate = x[: x.size // k * k].reshape(-1, k).mean(axis=1), rate / k
+    if even.size < 2:
+        return None
+    s = running_median(even, rate)
+    height = float(np.ptp(s))
+    ends = [
+        end
+        for turned in (False, True)
+        if (end := _end(even[::-1] if turned else even, rate, height, turned)) is not None
+    ]
+    if not ends:
+        return None
+    best = min(ends, key=lambda end: end.scatter)
+    same = [end for end in ends if abs(end.level - best.level) <= BAND * height]
+    above = even - best.level
+    found = plateau(above, rate)
+    if found not in (None, (0, even.size)):
+        hold = scipy.signal.detrend(above[slice(*found)])
+        scatter = float(np.std(hold))
+    else:
+        beyond = np.abs(s - best.level) > 0.5 * np.max(np.abs(s - best.level))
+        size = _size(even, rate)
+        pieces = even[beyond][: np.sum(beyond) // size * size].reshape(-1, size)
+        scatter = float(np.median(np.std(pieces, axis=1))) if pieces.size else 0.0
+    far = max((float(s.min()), float(s.max())), key=lambda edge: abs(edge - best.level))
+    spread = float(np.ptp([end.level for end in same]))
+    most = max(end.scatter for end in same)
+    return Rest(
+        float(np.mean([end.level for end in same])),
+        most / scatter if scatter > 0 else math.inf,
+        same[0].begin,
+        same[0].end,
+        abs(best.level) <= max(NOTHING * height, NOISE * best.scatter),
+        spread <= AGREE * height,
+        len(same) > 1 or abs(best.level) < abs(far),
+    )
+
+
+def _end(x: Float[np.ndarray, " times"], rate: float, height: float, turned: bool) -> _Rest | None:
+    """The level with which a signal begins, if it leaves it; `turned`: of one that runs
+    backwards."""
+    least = max(round(SHORT * rate), 2)
+    smooth = scipy.ndimage.median_filter(x, max(round(0.1 * rate), 1), mode="nearest")
+    away = np.flatnonzero(np.abs(smooth - np.median(x[:least])) > LEFT * height)
+    count = int(KEPT * away[0]) if away.size else 0
+    if count < least:
+        return None
+    slope = float(np.polyfit(np.arange(count), x[:count], 1)[0])
+    if abs(slope) * count > 0.65 * LEFT * height:  # a slow ramp
+        return None
+    span = ((x.size - count) / rate, x.size / rate) if turned else (0.0, count / rate)
+    return _Rest(float(np.mean(x[:count])), float(np.std(x[:count])), *span)
+
+
+def without_rest(
+    x: Float[np.ndarray, " times"], rate: float, start: float, unit: str, baseline: Baseline
+) -> tuple[Float[np.ndarray, " times"], list[str]]:
+    """The signal less its level at rest, and what is to be said of it.
+
+    With `baseline` (a, b) that is the mean from a to b [s]; "none" subtracts nothing. By default it
+    is `find_rest`, and subtracted only if it is quiet: if it scatters less than a tenth as much as
+    the hold does, so that it is the sensor's zero and not a weight that is held, and if it is the
+    same before and after. Within 1 % of the height, or two of its own deviations, it is zero.
+    """
+    if baseline == "none":
+        return x, []
+    if baseline is not None:
+        a, b = _span(baseline, start, start + x.size / rate)
+        part = x[round((a - start) * rate) : round((b - start) * rate)]
+        require(part.size > 0, "baseline", baseline, "give a longer part")
+        level = float(np.mean(part))
+        words = f"the mean from {a:g} s to {b:g} s, {level:.4g} {unit}, was subtracted as asked"
+        return x - level, [words]
+    rest = find_rest(x, rate)
+    if rest is None or rest.zero:
+        return x, []
+    when = ":".join(f"{round(start + edge, 2):g}" for edge in (rest.begin, rest.end))
+    said = (
+        f"{AT_REST}({when.replace(':', ' s to ')} s) the signal is {rest.level:.4g} {unit}, not 0"
+    )
+    if rest.quiet:
+        keep = '--baseline none keeps it (in Python baseline = "none")'
+        return x - rest.level, [f"{said}. This was subtracted; {keep}"]
+    if rest.share >= 1 or not rest.likely:
+        return x, []
+    why = (
+        f"it scatters {rest.share:.2g} times as much as in the hold, so it may be a force"
+        if rest.agree
+        else "it differs before and after the hold"
+    )
+    edges = when.replace(":", ", ")
+    return x, [
+        f"{said}. This was not subtracted: {why}. If it is the sensor's zero, give --baseline"
+        f" {when} (in Python baseline = ({edges})); if not, --baseline none"
+    ]
+
+
+def _span(baseline: Any, start: float, stop: float) -> tuple[float, float]:
+    edges = baseline.split(":") if isinstance(baseline, str) else baseline
+    try:
+        a, b = (float(edge) for edge in edges)
+    except (TypeError, ValueError):
+        a, b = math.nan, math.nan
+    remedy = (
+        f"give a part in which the signal rests, two times between {start:g} and {stop:g} s as"
+        " 0:1 (in Python also (0, 1)), or none"
+    )
+    require(start - 1e-9 <= a < b <= stop + 1e-9, "baseline", baseline, remedy)
+    return a, b
 
 
 def checked(samples: Any, rate: float, start: float) -> Float[np.ndarray, " all"]:

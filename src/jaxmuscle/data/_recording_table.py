@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxmuscle._common.text import printable
 
 from ._recording_channels import Channel, numbers
-from ._units import name_and_unit, seconds
+from ._units import name_and_unit, quantity_of, seconds
 
 TRIPLES = (
     ("_x", "_y", "_z"),
@@ -156,6 +156,12 @@ def bare(name: str) -> str:
 def units_of(names: Iterable[str]) -> dict[str, str]:
     """The units that names of columns hold."""
     return {name: unit for name in names if (unit := name_and_unit(name)[1]) is not None}
+
+
+def measured_in(table: Table, name: str) -> str | None:
+    """What a column holds by its unit: force, torque, displacement, angle, ...; `None` for an
+    unknown one."""
+    return quantity_of(table.units.get(name, ""), name)
 
 
 def listed(names: Iterable[str]) -> str:

@@ -20,7 +20,17 @@ from jaxmuscle.spectra._fluctuations import variance_spectrum
 from jaxmuscle.spectra._settings import require
 
 from ._measure import Measure, likelier_error
-from ._measured import RANGES, RECORDED, SLOWEST, VARIATION, measure_signals, tremor_band
+from ._measured import (
+    FLOATING,
+    LEVEL_NAME,
+    MEAN,
+    RANGES,
+    RECORDED,
+    SLOWEST,
+    VARIATION,
+    measure_signals,
+    searched_band,
+)
 from ._measured_text import measured_lines, range_words
 from ._recording import SEGMENTS, SHORTEST, Recording, notices_of, unlike
 
@@ -136,9 +146,12 @@ def _plain(measures: dict[str, Measure]) -> dict[str, Any]:
 
 
 def steadiness(
-    recordings: Recording | Iterable[Recording], *, band: tuple[float, float] | None = None
+    recordings: Recording | Iterable[Recording],
+    *,
+    band: tuple[float, float] | None = None,
+    mvc: float | int | None = None,
 ) -> Steadiness:
-    """How steady a force, torque or displacement is held: variability, power by band, regularity.
+    """How steady a force, torque or displacement is held, or how a limb trembles: variability, power by band, regularity.
     No model is fitted.
 
         print(jm.steadiness(jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()))
@@ -149,7 +162,8 @@ def steadiness(
     | name | what it is |
     |---|---|
     | `mean`, `standard_deviation` | μ and σ [unit]; σ² divides by the number of samples |
-    | `coefficient_of_variation` | σ / abs(μ), a fraction; NaN where σ exceeds abs(μ) |
+    | `level` | μ / `mvc`, a fraction, if it is given |
+    | `coefficient_of_variation` | σ / abs(μ), a fraction; NaN where σ exceeds abs(μ), and of an acceleration or angular velocity |
     | `..._without_drift` | the same about the least-squares line, over abs(μ) |
     | `..._above_0.5` | the same without what is slower than 0.5 Hz: √(Σ of the powers above) / abs(μ) |
     | `power_0_0.5` ... `power_8_12`, `power_above_12` | power in the bands of the fits' `band_...`, and from 12 to 30 Hz [unit²] |
@@ -195,7 +209,9 @@ def steadiness(
 
     **Arguments:** `recordings`, one or several trials of one condition of one person, in one unit;
     `band` (low, high) [Hz] in which a tremor is looked for, by default 6 to 12 Hz in a force, 3 to
-    20 Hz in a displacement or an acceleration.
+    20 Hz in what moves (displacement, angle, acceleration, angular velocity).
+
+    `mvc` [unit], the mean of a maximal voluntary contraction, counted from rest as the recordings.
 
     **Returns:** a `Steadiness`; it prints, plots and saves itself.
 
@@ -222,9 +238,14 @@ def steadiness(
     ]
     durations = {name: recording.duration for name, recording in zip(names, each, strict=True)}
     signals = [recording.filtered() for recording in each]
-    usual = tremor_band(each[0].quantity)
+    quantity, highest = each[0].quantity, min(recording.rate for recording in each) / 2
+    usual = searched_band(quantity, highest)
     band = usual if band is None else (float(band[0]), float(band[1]))
-    own, together = measure_signals(signals, each[0].unit, band)
+    own, together = measure_signals(signals, each[0].unit, quantity, band, highest)
+    if mvc is not None:
+        mean = abs(together[MEAN].value)
+        require(mean <= mvc < math.inf, "mvc", mvc, f"give a force above the mean, {mean:.4g}")
+        own, together = [_with_level(m, mvc) for m in own], _with_level(together, mvc)
     trials = dict(zip(names, own, strict=True))
     said = notices_of(each, signals, float(RECORDED.rate), [()] * len(each), each[0].quantity)
     if (
@@ -238,9 +259,20 @@ def steadiness(
         )
     if len(each) < ENOUGH:
         said = (*said, *_notice_wandering(signals))
-    notices = (*said, *_mind(durations, together, list(trials.values())))
-    unit, quantity = each[0].unit, each[0].quantity
+    notices = (*said, *_mind(durations, together, list(trials.values()), quantity, highest))
+    unit = each[0].unit
     return Steadiness(together, trials, durations, unit, quantity, band, notices)
+
+
+def _with_level(measures: dict[str, Measure], mvc: float | int) -> dict[str, Measure]:
+    """The measures with the mean over that of a maximal contraction behind it."""
+    mean, *others = measures.items()
+    value, stderr, _, error_from, interval = vars(mean[1]).values()
+    scale = math.copysign(1 / mvc, value)
+    low, high = sorted(scale * end for end in interval or (math.nan, math.nan))
+    error, ends = None if stderr is None else stderr / mvc, interval and (low, high)
+    level = Measure(scale * value, error, "1", error_from, ends)
+    return dict([mean, (LEVEL_NAME, level), *others])
 
 
 def _notice_wandering(signals: list[np.ndarray]) -> tuple[str, ...]:
@@ -274,7 +306,11 @@ def _same_unit(each: list[Recording]) -> None:
 
 
 def _mind(
-    durations: dict[str, float], together: dict[str, Measure], own: list[dict[str, Measure]]
+    durations: dict[str, float],
+    together: dict[str, Measure],
+    own: list[dict[str, Measure]],
+    quantity: str | None,
+    highest: float,
 ) -> Iterable[str]:
     short, long = min(durations.values()), max(durations.values())
     if long > ALIKE * short:
@@ -282,8 +318,26 @@ def _mind(
             f"the trials last {short:.3g} s to {long:.3g} s: what is slow (variation, power below"
             " 0.5 Hz, DFA exponent) grows with the length, so choose windows of one length"
         )
-    if math.isnan(together[VARIATION].value):
+    if quantity in FLOATING:
+        yield (
+            f"the mean of an {quantity} is {'gravity and' if quantity == FLOATING[0] else 'the'}"
+            " offset of the sensor: there is no coefficient of variation"
+        )
+    elif math.isnan(together[VARIATION].value):
         yield "the mean is near zero: there is no coefficient of variation"
+    left_out = [
+        range_words(*edges)
+        for name, edges in RANGES.items()
+        if f"power{name}" in together and math.isnan(together[f"power{name}"].value)
+    ]
+    if left_out:
+        yield (
+            f"nothing above {highest:g} Hz was recorded: the power from {', '.join(left_out)} is"
+            " left out. Entropies and DFA exponent are of what is slower, so compare them with"
+            " recordings of the same rate only"
+        )
+    if math.isnan(together["tremor_p"].value):
+        yield "a tremor was not looked for: its band is not in what was recorded"
     likelier = (
         {name: likelier_error([m[f"power{name}"] for m in own]) for name in RANGES}
         if len(own) >= ENOUGH

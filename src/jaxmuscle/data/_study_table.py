@@ -32,6 +32,7 @@ FILES, SPECTRA = (*Reading._fields, "skip_rows", "sheet"), ("spectrum", "mvc")
 EDGES = ("window_start", "window_stop")
 STEADY = "`window` of the study.toml, else its steady part; an error beside the other edge"
 NUMBERS = ("rate", "max_gap", "lever_arm", "skip_rows", "mvc", *EDGES)
+ANSWERS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 COLUMNS = (*LABELS, *FILES, *SPECTRA, *EDGES)
 READING = (*FILES, *SPECTRA, "window")
 OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction")
@@ -61,7 +62,10 @@ class ReadingTable(Table, kw_only=True):
     ] = None
     units: Annotated[
         str | None,
-        says("Unit of the column", missing="as the file says, else N; of a point an error"),
+        says(
+            "Unit of the column",
+            missing="as file or name say; of a point an error",
+        ),
     ] = None
     axis: Annotated[
         str | None,
@@ -97,6 +101,21 @@ class ReadingTable(Table, kw_only=True):
             "From the axis to where the force acts [m]: turns a torque into N",
             missing="a torque stays a torque",
         ),
+    ] = None
+    quantity: Annotated[
+        str | None,
+        says("What was measured", missing="follows from the unit, else from the column's name"),
+    ] = None
+    baseline: Annotated[
+        str | tuple[float, float] | None,
+        says(
+            "Part in which the signal rests, as 0:1 [s]: its mean is subtracted; or none",
+            missing="found, and subtracted if it is quiet",
+        ),
+    ] = None
+    detrend: Annotated[
+        bool | None,
+        says("Whether the straight line through the steady part is subtracted", missing="false"),
     ] = None
     skip_rows: Annotated[
         Annotated[int, Meta(ge=0)] | None, says("Lines to leave out at the top", missing="0")
@@ -339,7 +358,7 @@ def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cel
             recording = load_recording(row.file, **reading)
             remedy = "give all in one unit, with the column units or by converting the files"
             _as_before(stated, "unit", row, recording.unit, remedy)
-            together[whose].append(recording if window == "all" else recording.steady(window))
+            together[whose].append(recording.steady(window))
         except ValueError as error:
             raise ValueError(f"{row.place}: {error}") from None
     found = []
@@ -395,6 +414,10 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
         row: dict[str, Any] = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
         for name in set(NUMBERS) & set(row):
             row[name] = _number(name, row[name], delimiter, place)
+        if "detrend" in row:
+            answer = row["detrend"].casefold()
+            require(answer in ANSWERS, f"{place}: detrend", row["detrend"], "write true or false")
+            row["detrend"] = ANSWERS[answer]
         found.append((place, row))
     return found
 

@@ -15,6 +15,7 @@ from jaxmuscle.spectra._welch import Spectrum
 
 from ._recording import Recording, notices_of, pooled_target, recorded_settings
 from ._recording_files import load_columns, load_recording, read_tables
+from ._recording_quality import Baseline
 from ._recording_table import Table
 from ._target import Target
 
@@ -71,7 +72,7 @@ class Trials(Shown, Sequence[Recording]):
         """What the names of the recordings have in common, or how many there are."""
         return name_of_all([recording.name for recording in self.recordings])
 
-    def steady(self, window: Sequence[float | int] | None = None) -> "Trials":
+    def steady(self, window: Sequence[float | int] | str | None = None) -> "Trials":
         """Every recording with its steady part as window, see `Recording.steady`."""
         return Trials(recording.steady(window) for recording in self.recordings)
 
@@ -159,6 +160,9 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
     max_gap: float | int = 0.2,
     outliers: str = "keep",
     lever_arm: float | int | None = None,
+    quantity: str | None = None,
+    baseline: Baseline = None,
+    detrend: bool = False,
 ) -> Trials:
     """Load the trials of one person in one condition.
 
@@ -171,8 +175,8 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
     - `columns`: which columns of this one file are trials (by default all with numbers but the
       time)
     - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `sheet`, `max_gap`,
-      `outliers`, `lever_arm`: as in `load_recording`, the same for all files. Several sheets of one
-      layout in a workbook are trials, unless `sheet` names one
+      `outliers`, `lever_arm`, `quantity`, `baseline`, `detrend`: as in `load_recording`, the same
+      for all files. Several sheets of one layout in a workbook are trials, unless `sheet` names one
 
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does,
     and for different units.
@@ -186,6 +190,9 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
         "max_gap": max_gap,
         "outliers": outliers,
         "lever_arm": lever_arm,
+        "quantity": quantity,
+        "baseline": baseline,
+        "detrend": detrend,
     }
     if isinstance(paths, str | os.PathLike | Table):
         require(

@@ -1,21 +1,25 @@
 """Which columns of a file are the force and the displacement of a perturbation experiment."""
 
-import math
 import os
 import re
 from collections.abc import Sequence
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from jaxmuscle.spectra._settings import require
 
 from ._as_target import is_recording
 from ._perturbed import PerturbedRecording
-from ._recording_choice import FORCE, Reading, perturbed_of, signals
+from ._recording_choice import (
+    FORCE,
+    MEASURED,
+    Movement,
+    Reading,
+    movement_of,
+    perturbed_of,
+    signals,
+)
 from ._recording_files import read_table, read_tables
-from ._recording_table import Table, bare, find, listed, values
-from ._units import quantity_of, scale_to_si
+from ._recording_table import Table, bare, find, listed, measured_in
 
 CALLED = {
     "force": FORCE,
@@ -23,23 +27,6 @@ CALLED = {
         r"disp(lacement)?|length|position|pos|angle|way|weg|auslenkung|winkel|x_z"
     ),
 }
-MEASURED = {"force": ("force", "torque"), "displacement": ("displacement", "angle")}
-# Standard deviations below which the insertion was held: it moves no force that one could see. In
-# mm, and in degrees.
-STILL = {"mm": 0.03, "deg": 0.1}
-
-
-class Movement(NamedTuple):
-    """By how much the insertion moves: standard deviation `size` in `unit`. It `rests` if that is
-    as good as nothing."""
-
-    size: float
-    unit: str
-    rests: bool
-
-    def __str__(self) -> str:
-        # rounding error is no movement
-        return f"{round(self.size, 9):.3g} {self.unit}".rstrip() + " rms"
 
 
 def movement(
@@ -60,17 +47,7 @@ def movement(
     """
     table = read_table(path, skip_rows)
     name = find(table, displacement, "displacement")
-    samples = values(table, [name])[:, 0]
-    middle = samples[samples.size // 4 : samples.size - samples.size // 4]
-    size = float(np.std(middle[np.isfinite(middle)])) if np.isfinite(middle).any() else math.nan
-    unit = table.units.get(name, "")
-    if quantity_of(unit) not in MEASURED["displacement"]:
-        return Movement(size, unit, size == 0)
-    turned = quantity_of(unit) == "angle"
-    scale, _ = scale_to_si(unit, "displacement_units", "displacement", 1.0)
-    size *= scale * (180 / math.pi if turned else 1e3)
-    shown = "deg" if turned else "mm"
-    return Movement(size, shown, size < STILL[shown])
+    return movement_of(table, name)
 
 
 def two_channels(
@@ -106,9 +83,7 @@ def _found_in(
     others, found = signals(table, time), dict[str, list[str]]()
     for role, given in (("force", force), ("displacement", displacement)):
         named = [name for name in others if CALLED[role].fullmatch(bare(name))]
-        meant = [
-            name for name in others if quantity_of(table.units.get(name, "")) in MEASURED[role]
-        ]
+        meant = [name for name in others if measured_in(table, name) in MEASURED[role]]
         found[role] = (
             [find(table, given, role)]
             if given is not None

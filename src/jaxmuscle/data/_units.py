@@ -1,8 +1,10 @@
-"""Units as files write them: of a signal, and of its times."""
+"""Units as files write them: of a signal, and of its times; what the name of a column says it
+holds."""
 
 import math
 import re
-from typing import TYPE_CHECKING, Any
+import unicodedata
+from typing import Any
 
 import numpy as np
 
@@ -10,65 +12,66 @@ from jaxmuscle._common.arguments import require
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.units import NEWTONS
 
-if TYPE_CHECKING:
-    from ._target_fields import Quantity
-
-UNITS: "dict[str, Quantity | None]" = {
-    "N": "force",
-    "mN": "force",
-    "kN": "force",
-    "kgf": "force",
-    "gf": "force",
-    "lbf": "force",
-    "% MVC": "force",
-    "N m": "torque",
-    "N cm": "torque",
-    "N mm": "torque",
-    "m": "displacement",
-    "cm": "displacement",
-    "mm": "displacement",
-    "um": "displacement",
-    "m/s^2": "acceleration",
-    "mm/s^2": "acceleration",
-    "g": "acceleration",
-    "mg": "acceleration",
-    "V": None,
-    "mV": None,
-    "a.u.": None,
-}
-# of a signal: what a load cell weighs
-_SPELLINGS = {
-    "nm": "N m",
-    "ncm": "N cm",
-    "nmm": "N mm",
-    "%mvc": "% MVC",
-    "pctmvc": "% MVC",
-    "%": "% MVC",
-    "\u03bcm": "um",
-    "au": "a.u.",
-    "newton": "N",
-    "newtons": "N",
-    "volt": "V",
-    "volts": "V",
-    "kg": "kgf",
-    "kp": "kgf",
-    "lb": "lbf",
-    "lbs": "lbf",
+# Each unit, what it measures (None: anything), and how else it is written, without blanks, in small
+# letters. A load cell weighs in kg, and every unit may also be written in capitals or as it is.
+_TABLE: tuple[tuple[str, str | None, str], ...] = (
+    ("N", "force", "newton newtons"),
+    ("mN", "force", "millinewton millinewtons"),
+    ("kN", "force", "kilonewton kilonewtons"),
+    ("kgf", "force", "kg kp kgs kilogram kilograms kilopond kgforce kilogramforce"),
+    ("gf", "force", "gramforce gramsforce pond"),
+    ("lbf", "force", "lb lbs lbsf pound pounds poundforce poundsforce"),
+    ("% MVC", "force", "%mvc mvc% %ofmvc pctmvc percentmvc percentofmvc %mvf %mvic %mvt %"),
+    ("N m", "torque", "newtonmeter newtonmeters newtonmetre newtonmetres"),
+    ("mN m", "torque", ""),
+    ("N cm", "torque", ""),
+    ("N mm", "torque", ""),
+    ("kgf m", "torque", "kgm kpm"),
+    ("lbf ft", "torque", "ftlb ftlbs ftlbf lbft lbsft footpound footpounds poundfoot poundfeet"),
+    ("lbf in", "torque", "inlb inlbs inlbf lbin lbsin inchpound inchpounds"),
+    ("m", "displacement", "meter meters metre metres"),
+    ("cm", "displacement", "centimeter centimeters centimetre centimetres"),
+    ("mm", "displacement", "millimeter millimeters millimetre millimetres"),
+    ("um", "displacement", "micrometer micrometers micron microns"),
+    ("deg", "angle", "degree degrees ° grad"),
+    ("rad", "angle", "radian radians"),
+    ("m/s^2", "acceleration", "ms2 m/s/s m/sec2 m/s2 ms^2 m/sec/sec mps2"),
+    ("mm/s^2", "acceleration", "mms2 mm/s/s mm/sec2"),
+    ("g", "acceleration", "g's gs gn g0"),
+    ("mg", "acceleration", ""),
+    ("deg/s", "angular velocity", "dps °/s deg/sec degs1 degree/s degrees/s degps"),
+    ("rad/s", "angular velocity", "rads1 rad/sec radian/s radians/s radps"),
+    ("V", None, "volt volts"),
+    ("mV", None, "millivolt millivolts"),
+    ("uV", None, "microvolt microvolts"),
+    ("a.u.", None, "arb arbunits arbitraryunits counts count adc lsb bits"),
+)
+UNITS = {unit: quantity for unit, quantity, _ in _TABLE}
+SCALELESS = ("a.u.",)  # whose numbers say something only relative to their mean
+# With a capital M these would be millions.
+_SMALL = ("mN", "mN m")
+# What a unit means in a column of that quantity; None where it is one that is not known here, as
+# nm of a length are nanometres.
+_MEANT = {
+    ("force", "g"): "gf",
+    ("force", "mg"): None,
+    ("displacement", "N m"): None,
+    ("magnetic field", "g"): None,
+    ("magnetic field", "mg"): None,
 }
 _SI = {
     "force": NEWTONS,
-    "torque": {"N m": 1.0, "N cm": 1e-2, "N mm": 1e-3},
+    "torque": {
+        "N m": 1.0,
+        "mN m": 1e-3,
+        "N cm": 1e-2,
+        "N mm": 1e-3,
+        "kgf m": NEWTONS["kgf"],
+        "lbf ft": 0.3048 * NEWTONS["lbf"],
+        "lbf in": 0.0254 * NEWTONS["lbf"],
+    },
     "displacement": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
     "angle": {"rad": 1.0, "deg": math.pi / 180},
-}
-_ANGLES = {
-    "rad": "rad",
-    "radian": "rad",
-    "radians": "rad",
-    "deg": "deg",
-    "degree": "deg",
-    "degrees": "deg",
-    "°": "deg",
 }
 _SECONDS = {
     1.0: "s sec secs sek seg second seconds sekunden secondes segundos",
@@ -79,29 +82,105 @@ _SECONDS = {
     1e-9: "ns nsec nanoseconds",
 }
 SECONDS = {name: scale for scale, names in _SECONDS.items() for name in names.split()}
-_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*")
-_SUFFIX = re.compile(
-    r"(.+?)(?:_|\s*/\s*)(N|mN|kN|kgf?|gf|lbf|lbs?|pctMVC|Nm|Ncm|Nmm|m|cm|mm|um|µm|V|mV|s|ms|us|ns|deg|rad)\s*"
-)
+# Words in the name of a column that say what it holds.
+_WORDS = {
+    "force": "force forces kraft load loadcell grip pinch fuerza forza forca kracht weight f fx fy"
+    " fz",
+    "torque": "torque torques moment moments drehmoment mx mz",
+    "acceleration": "acc accel accelerometer acceleration accelerations beschleunigung ax ay az",
+    "angular velocity": "angular gyro gyr gyroscope omega drehrate",
+    "pressure": "pressure druck",
+    "displacement": "position pos displacement disp length weg auslenkung",
+    "angle": "angle winkel goniometer gonio",
+    "velocity": "velocity speed vel",
+    "magnetic field": "mag magnetometer",
+    "electromyogram": "emg semg",
+    "temperature": "temperature temp",
+    "raw signal": "raw counts adc bits",
+    "time": "time zeit t temps tiempo tempo tijd timestamp",
+}
+_QUANTITIES = {word: quantity for quantity, words in _WORDS.items() for word in words.split()}
+# What another word in the name says better, the vaguest last.
+_VAGUE = ("force", "raw signal", "time")
+_WORD = re.compile(r"[A-Z]?[a-zäöüß]+|[A-ZÄÖÜ]+(?![a-zäöü])")
+_BRACKETS = re.compile(r"\[([^\[\]]+)\]|\(([^()]+)\)")
+# Where a name may end and its unit begin. A unit of several words is tried before its last word.
+_BORDER = re.compile(r"\s*(?:[_/,;:.–—-]|\bin\b|\s)\s*")
+# What a unit is by itself behind _ or /, whatever the name.
+_PLAIN = [
+    "N",
+    "mN",
+    "kN",
+    "kg",
+    "kgf",
+    "gf",
+    "lb",
+    "lbs",
+    "lbf",
+    "pctMVC",
+    "Nm",
+    "Ncm",
+    "Nmm",
+    "m",
+    "cm",
+    "mm",
+    "um",
+    "µm",
+    "V",
+    "mV",
+    "s",
+    "ms",
+    "us",
+    "ns",
+    "deg",
+    "rad",
+]
 
 
-def known_unit(unit: str) -> str | None:
-    """The unit as `UNITS` writes it (`Nm`, `N·m`, `N*m` are `N m`; `m/s²`, `m/s2` are `m/s^2`), or
-    `None` if not there."""
-    bare = "".join(
-        unit.replace("μ", "µ")
-        .replace("²", "2")
-        .translate(str.maketrans("", "", "·*.^()[]"))
-        .split()
-    )
-    exact = {"".join(name.replace(".", "").replace("^", "").split()): name for name in UNITS}
-    return exact.get(bare) or _SPELLINGS.get(bare.casefold())
+def _squeezed(unit: str, slash: str) -> str:
+    """A unit without blanks and signs between its parts; `slash` stands for `_`."""
+    plain = unicodedata.normalize("NFKC", unit.replace("º", "°"))
+    return re.sub(r"[\s·⋅∙•×*.^()\[\]−-]", "", plain.replace("μ", "u").replace("_", slash))
 
 
-def quantity_of(unit: str) -> str | None:
+_EXACT = {_squeezed(unit, ""): unit for unit in UNITS}
+_SPELLED = {_squeezed(unit, "").casefold(): unit for unit in UNITS} | {
+    word: unit for unit, _, words in _TABLE for word in words.split()
+}
+
+
+def known_unit(unit: str, name: str = "") -> str | None:
+    """The unit as `UNITS` writes it (`Nm`, `N·m`, `N-M` are `N m`; `m/s²`, `ms-2` are `m/s^2`), or
+    `None` if not there.
+
+    Capitals do not matter (`G` is `g`), except that `MN` is not `mN`. The `name` of its column says
+    which of two is meant: `g` of a force are grams, `nm` of a length nanometres.
+    """
+    for bare in (_squeezed(unit, "/"), _squeezed(unit, "")):
+        found = _EXACT.get(bare) or _SPELLED.get(bare.casefold())
+        if found is not None and not (found in _SMALL and bare.startswith("M")):
+            return _MEANT.get((named_quantity(name) or "", found), found)
+    return None
+
+
+def quantity_of(unit: str, name: str = "") -> str | None:
     """What a unit measures: force, torque, displacement, angle, ...; `None` for an unknown one."""
-    turned = unit.strip(" []()").casefold() in _ANGLES
-    return "angle" if turned else UNITS.get(known_unit(unit) or "")
+    return UNITS.get(known_unit(unit, name) or "")
+
+
+def named_quantity(name: str) -> str | None:
+    """What the words in the name of a column say that it holds: `Right Force` a force, `acc_x` an
+    acceleration, `Force Plate Moment` a torque; `None` where they say nothing."""
+    words = (word.casefold() for word in _WORD.findall(name))
+    found = [_QUANTITIES[word] for word in words if word in _QUANTITIES]
+    rank = {quantity: place for place, quantity in enumerate(_VAGUE, 1)}
+    return min(found, key=lambda quantity: rank.get(quantity, 0), default=None)
+
+
+def units_for(quantity: str | None) -> list[str]:
+    """The units that a quantity is likely to have; of what a converter hands over volts."""
+    measured = None if quantity in ("raw signal", "electromyogram") else quantity or ""
+    return [unit for unit, each in UNITS.items() if each == measured]
 
 
 def seconds(unit: str | None) -> float | None:
@@ -111,13 +190,34 @@ def seconds(unit: str | None) -> float | None:
 
 def name_and_unit(name: str) -> tuple[str, str | None]:
     """A column's name in small letters, and the unit it holds: `Force [N]`, `Kraft / N`, `force_N`,
-    `torque_Nm`."""
-    found = _BRACKETS.fullmatch(name) or _SUFFIX.fullmatch(name)
-    return (
-        (found[1].strip().casefold(), found[2].strip())
-        if found
-        else (name.strip().casefold(), None)
-    )
+    `Kraft in N`, `torque_nm`, `acc_ms2`, `Force %MVC`.
+
+    What stands behind the name without brackets counts as its unit if the name says that it holds
+    that quantity. So `acc_g` has a unit, and `trial_g` has none.
+    """
+    for found in _BRACKETS.finditer(name):
+        unit, rest = (found[1] or found[2]).strip(), name[found.end() :].strip()
+        if not rest or known_unit(unit) or seconds(unit):
+            return f"{name[: found.start()].strip()} {rest}".strip().casefold(), unit
+    for border in _BORDER.finditer(name, 1):
+        head, unit = name[: border.start()], name[border.end() :].strip()
+        if head.strip() and _is_unit(unit, head, border[0].strip()):
+            return head.strip().casefold(), unit
+    return name.strip().casefold(), None
+
+
+def _is_unit(text: str, head: str, border: str) -> bool:
+    """Whether a text behind the name `head` is its unit."""
+    if name_and_unit(head)[1] or known_unit(head.split()[-1]):  # Nm/kg is no unit of kg
+        return False
+    if border in ("_", "/") and text in _PLAIN:
+        return True
+    named, unit = named_quantity(head), known_unit(text, head)
+    if unit is None:
+        return named == "time" and seconds(text) is not None
+    if UNITS[unit] is None or named is None:
+        return len(text) > 1 and (unit not in SCALELESS or _squeezed(text, "") == "au")
+    return UNITS[unit] == named or (unit == "% MVC" and named == "torque")
 
 
 def scale_to_si(unit: str, argument: str, quantity: str, lever_arm: Any) -> tuple[float, bool]:
@@ -130,12 +230,12 @@ def scale_to_si(unit: str, argument: str, quantity: str, lever_arm: Any) -> tupl
     arm that is missing.
     """
     turned = {"force": "torque", "displacement": "angle"}[quantity]
-    known = known_unit(unit) or _ANGLES.get(unit.strip(" []()").casefold())
+    known = known_unit(unit)
     remedy = (
         f"give the unit of a {quantity} or of its {turned};"
         f" {choices(unit, (*_SI[quantity], *_SI[turned]))}"
     )
-    if known in ("V", "mV"):
+    if known in ("V", "mV", "uV"):
         remedy = (
             "a sensor gives volts. Multiply by its calibration first"
             f" ({'N' if quantity == 'force' else 'm'} for each volt), and name the column with the"

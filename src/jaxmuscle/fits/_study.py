@@ -435,6 +435,9 @@ def run_study(  # noqa: PLR0913 (options of a public call)
     max_gap: float | int | None = None,
     outliers: str | None = None,
     lever_arm: float | int | None = None,
+    quantity: str | None = None,
+    baseline: str | Sequence[float | int] | None = None,
+    detrend: bool | None = None,
     spectrum: str | None = None,
     mvc: float | int | None = None,
 ) -> StudyResult:
@@ -474,8 +477,9 @@ def run_study(  # noqa: PLR0913 (options of a public call)
     - `progress`: True or a function of (text, share).
     - How files are read where a row does not say it: `window` (start, stop) [s] or "all" (by
       default the steady part); `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`,
-      `sheet`, `max_gap`, `outliers`, `lever_arm` as in `load_recording`; `spectrum`, a name of
-      settings, the same for all; `mvc` as in `Trials.target`.
+      `sheet`, `max_gap`, `outliers`, `lever_arm`, `quantity`, `baseline`, `detrend` as in
+      `load_recording`; `spectrum`, a name of settings, the same for all; `mvc` as in
+      `Trials.target`.
 
     An option that is given here replaces that of the .toml; what a row says about its own file
     stays.
@@ -498,6 +502,9 @@ def run_study(  # noqa: PLR0913 (options of a public call)
         "max_gap": max_gap,
         "outliers": outliers,
         "lever_arm": lever_arm,
+        "quantity": quantity,
+        "baseline": baseline,
+        "detrend": detrend,
         "spectrum": spectrum,
         "mvc": mvc,
     }
