@@ -7,6 +7,7 @@ import pytest
 
 import jaxmuscle as jm
 from jaxmuscle.data._measured import RECORDED
+from jaxmuscle.data._recording import BURST
 from jaxmuscle.fits._signal_checks import CHANGES, check_signals
 from jaxmuscle.model._noise import NoiseSum
 
@@ -24,8 +25,8 @@ def records(task):
     return np.asarray(runs.filtered(RECORDED, (LEAD, LEAD + 15.0)), float)
 
 
-def noticed(signals, task):
-    target = jm.Target("someone", np.ones(30), settings=RECORDED, signals=signals)
+def noticed(signals, task, notices=()):
+    target = jm.Target("someone", np.ones(30), settings=RECORDED, signals=signals, notices=notices)
     return check_signals(target, task, jax.random.key(0))
 
 
@@ -45,6 +46,8 @@ def test_what_changes_its_size_is_found_and_widens_the_errors(records, task):
         found = noticed([about(x, 1 + 0.5 * np.sin(2 * np.pi * time / 8))], task)
         assert len(found.notices) == 1 and CHANGES in found.notices[0]
         assert found.widening > 1.2 and found.common > 0
+    named = noticed([about(x, 1 + 0.5 * np.sin(2 * np.pi * time / 8))], task, [f"{BURST} at 6 s"])
+    assert named.widening == found.widening and CHANGES not in named.notices[0]
     growing = [about(x, 0.5 + 1.5 * time / time[-1]) for x in records[:3]]
     found = noticed(growing, task)
     assert "the fluctuations grow within the trials" in found.notices[0]

@@ -21,7 +21,7 @@ from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
 from ._measured import AS_RECORDED, FLOATING, MOTIONS, RECORDED, measure_signals
 from ._recording_choice import Reading, recording_of
-from ._recording_outliers import OUTSIDE, Burst, find_bursts
+from ._recording_outliers import OUTLIERS, OUTSIDE, Burst, find_bursts
 from ._recording_quality import (
     AT_REST,
     Baseline,
@@ -653,6 +653,8 @@ def notices_of(
     `more` of each of them."""
     unit, held = recordings[0].unit, quantity in ("force", "torque")
     bursts = find_bursts(signals, rate) if held else []
+    kept = [any(n.endswith(OUTLIERS["keep"]) for n in r.notices) for r in recordings]
+    bursts = [b for b in bursts if not kept[b.signal]]  # outliers make one, and are named already
     seen = [_events(r, [b for b in bursts if b.signal == i]) for i, r in enumerate(recordings)]
     # a slip of a second looks like another level
     seen = [

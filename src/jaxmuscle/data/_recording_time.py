@@ -23,7 +23,8 @@ _TIME = re.compile(
 RATE_TOLERANCE = 5e-3
 JITTER = 0.25  # of a sampling interval
 LOOSE = 0.05  # by how much a rate that is asked for may differ from that of uneven times
-READINGS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+# days are those of spreadsheets
+READINGS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "days": 86400.0}
 SLOWEST, FASTEST = 24.0, 20_000.0  # Hz, between which the times of a recording are read
 LASTS = 3 * 3600.0  # s, a recording of a sample each second, or of ten, hardly lasts longer
 EPOCH = 1e9, 4.2e9  # s since 1970: the years 2001 to 2103
@@ -266,9 +267,9 @@ def _unit_of(
 ) -> tuple[float | None, list[str]]:
     """Seconds in the unit of the times, and what to say of it; `None` where they only count rows.
 
-    Without a stated unit a rate decides, then a date (seconds since 1970), then the size: read in
-    s, ms, us, ns they have a rate from 24 Hz to 20 kHz in one unit at most, if seconds may be as
-    slow as 10 Hz. Whole equal steps that are small may also count rows or ticks.
+    Without a stated unit a rate decides, then a date (seconds since 1970), then the size: in one of
+    ms, us, ns and days at most they have a rate from 24 Hz to 20 kHz; s are taken from 10 Hz on.
+    Whole equal steps that are small may also count rows or ticks.
     """
     if clock.scale is not None:
         return clock.scale, []
@@ -283,7 +284,11 @@ def _unit_of(
         if EPOCH[0] <= raw[0] * scale <= EPOCH[1] and rates[unit] >= 1
     ]
     small = [u for u in list(READINGS)[1:] if SLOWEST <= rates[u] <= FASTEST]
-    unit = (by_rate + dated + small)[0] if rates["s"] < 10 and (by_rate + dated + small) else "s"
+    unit = (
+        (by_rate + dated + small)[0]
+        if not 10 <= rates["s"] <= 1e6 and (by_rate + dated + small)
+        else "s"
+    )
     unit = by_rate[0] if by_rate else unit
     if not by_rate and rate and usual == 1 and counts:
         return None, [f"column {clock.name} counts the rows: their rate is {rate:g} Hz as asked"]
@@ -330,7 +335,7 @@ def _placed(
             f"{table.file}, {table.place(at)}: time column {clock.name!r} has the time of the row"
             f" before again; if the row stands there twice, take one out. Or {_REMEDY}"
         )
-    interval, ends = usual, steps > longest + usual
+    interval, ends = float(np.median(steps)), steps > longest + usual
     near = steps[~ends]
     for _ in range(2):  # the second round counts the rows in long gaps rightly
         interval = float(np.sum(near) / max(np.sum(np.round(near / interval)), 1))
@@ -376,7 +381,8 @@ def _with_words(
         first = min(
             time[p.rows.start + int(np.argmax(d > least))] for p, d in holes if np.any(d > least)
         )
-        words.append(f"{missing} rows are missing in the times, the first after {first:.3f} s")
+        are = "row is" if missing == 1 else "rows are"
+        words.append(f"{missing} {are} missing in the times, the first after {first:.3f} s")
     if len(parts) > 1:
         spans = [f"{time[p.rows.start]:.6g}:{time[p.rows.stop - 1]:.6g}" for p in parts]
         more = f" and {len(spans) - 5} more" if len(spans) > 5 else ""
