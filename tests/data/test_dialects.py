@@ -295,12 +295,7 @@ TEXTS = {  # content, ending, column, unit
         0,
         "N",
     ),
-    "rate in a comment": (
-        "# fs: 100\n# Force [N]\n" + rows(X),
-        "txt",
-        None,
-        None,
-    ),
+    "rate in a comment": ("# fs: 100\n# Force [N]\n" + rows(X), "txt", None, "N"),
     "rate in another language": (
         "Fréquence d'échantillonnage : 100 Hz\nForce [N]\n" + rows(X),
         "txt",
@@ -320,6 +315,13 @@ TEXTS = {  # content, ending, column, unit
         "Force",
         "N",
     ),
+    "times of each sensor": (
+        "Avanti 1: EMG 1: Time Series (s),EMG 1 (mV),Avanti 2: FSR: Time Series (s),Force (N)\n"
+        + rows(TIME / 2, Y, TIME, X),
+        "csv",
+        "Force",
+        "N",
+    ),
     "times of one name": ("t,EMG,t,Force (N)\n" + rows(TIME / 2, Y, TIME, X), "csv", "Force", "N"),
     "row of rates": ("Force (N),EMG\n100 Hz,100 Hz\n" + rows(X, Y), "csv", "Force", "N"),
 }
@@ -331,7 +333,7 @@ def test_texts_of_programs(case, tmp_path):
     recording = load_recording(write(tmp_path, content, f"trial.{ending}"), column=column)
     np.testing.assert_array_equal(recording.whole, X)
     assert recording.rate == pytest.approx(RATE, rel=1e-9)
-    assert recording.unit == (unit or "N") and recording.start == 0
+    assert recording.unit == (unit or "a.u.") and recording.start == 0
 
 
 def test_blocks_of_vicon_are_kept_apart(tmp_path):
@@ -746,7 +748,7 @@ def test_mat_of_programs(case, tmp_path):
     recording = load_recording(tmp_path / "trial.mat", column=column)
     # LabChart and OTB save single precision
     np.testing.assert_allclose(recording.whole, X, rtol=1e-6, atol=CLOSE.get(case, 0))
-    assert (recording.rate, recording.unit) == (pytest.approx(RATE), unit or "N")
+    assert (recording.rate, recording.unit) == (pytest.approx(RATE), unit or "a.u.")
 
 
 def test_other_rates_are_of_other_channels(tmp_path):
@@ -815,7 +817,7 @@ def test_mat_of_programs_in_version_73(case, tmp_path):
     save73(tmp_path / "trial.mat", variables)
     recording = load_recording(tmp_path / "trial.mat", column=column)
     np.testing.assert_allclose(recording.whole, X, rtol=1e-6, atol=CLOSE.get(case, 0))
-    assert (recording.rate, recording.unit) == (pytest.approx(RATE), unit or "N")
+    assert (recording.rate, recording.unit) == (pytest.approx(RATE), unit or "a.u.")
 
 
 def test_variables_of_npz(tmp_path):

@@ -242,3 +242,9 @@ def test_the_rest_is_the_quieter_end():
     assert found is not None and found.begin > 18 and found.end == 19
     assert found.level == pytest.approx(20, abs=0.02)
     assert found.quiet and found.share == pytest.approx(0.04, abs=0.02)
+
+
+def test_a_clipped_signal_is_said_once():
+    found = jm.Recording(np.minimum(HELD, 39.9) + 20, RATE).steady()
+    (said,) = (notice for notice in found.notices if "clipped" in notice)
+    assert said.startswith("flat at its highest value 39.")

@@ -49,6 +49,10 @@ NAMES = {  # name of a column: what is left of it, its unit, what that measures
     "Force %MVC": ("force", "% MVC", "force"),
     "Force (% MVC)": ("force", "% MVC", "force"),
     "acquired data [%(MVC)]": ("acquired data", "% MVC", "force"),
+    "%MVC": ("%mvc", "% MVC", "force"),
+    "MVC %": ("mvc %", "% MVC", "force"),
+    "Nm": ("nm", "N m", "torque"),
+    "N": ("n", None, None),  # a number of rows
     "force_pct": ("force_pct", None, None),
     "Fz (kg)": ("fz", "kgf", "force"),
     "load_kg": ("load", "kgf", "force"),

@@ -124,13 +124,12 @@ class Recording(Shown, eqx.Module):
         self.quantity = measured or quantity
         given = checked(samples, self.rate, self.start)
         self.others, notices = tuple(others), tuple(notices)
-        marked = any(OUTSIDE in notice for notice in notices)
-        own = [] if marked else clipping(given, self.rate, self.start)
         if baseline is None and self.quantity in MOTIONS:
             baseline = "none"
         self.whole, said = without_rest(given, self.rate, self.start, self.unit, baseline)
         self.whole.setflags(write=False)
-        own.extend(said)
+        marked = any(OUTSIDE in notice for notice in notices)
+        own = [*([] if marked else clipping(self.whole, self.rate, self.start)), *said]
         if self.rate < RECORDED.rate:
             own.append(f"recorded at {self.rate:g} Hz: holds nothing above {self.rate / 2:g} Hz")
         self.notices = tuple(dict.fromkeys((*notices, *own)))

@@ -175,11 +175,13 @@ def _commented(
 ) -> list[str] | None:
     """The header in the last comment before the data, if it looks like one."""
     notes = [line.note for line in lines if line.note is not None and line.number < first]
-    names = cells_of(notes[-1], delimiter) if notes else []
+    # a single column may be called by several words
+    names = cells_of(notes[-1], "\t" if width == 1 else delimiter) if notes else []
     if not len(names) == width == len(set(names)):
         return None
     columns: Any = dict.fromkeys(names, list)
-    return names if clock(Table("", columns, True, {"": 1.0}, units_of(names))) else None
+    units = units_of(names)
+    return names if units or clock(Table("", columns, True, {"": 1.0}, units)) else None
 
 
 def _table(
@@ -233,7 +235,7 @@ def _column(
 
 def _clocks(given: list[str], known: list[str], units: Mapping[str, str]) -> dict[str, str]:
     """The time of every column where there are several columns of times, each before its own: they
-    have one name, or that of what follows."""
+    have one name, or that of what follows, or are all called a time."""
     bare_names = [name_and_unit(name)[0] for name in given]
     times = [
         j
@@ -244,6 +246,9 @@ def _clocks(given: list[str], known: list[str], units: Mapping[str, str]) -> dic
         return {}
     bares = [bare_names[j] for j in times]
     own = [_TIME_OF.sub("", bare_names[j]) == "".join(bare_names[j + 1 : j + 2]) for j in times]
-    if len(set(bares)) > 1 and not all(own):
+    followed = all("time" in name for name in bares) and all(
+        j + 1 < len(known) and j + 1 not in times for j in times
+    )
+    if len(set(bares)) > 1 and not all(own) and not followed:
         return {}
     return {name: known[max(t for t in times if t <= j)] for j, name in enumerate(known)}

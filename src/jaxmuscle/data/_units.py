@@ -193,7 +193,7 @@ def name_and_unit(name: str) -> tuple[str, str | None]:
     `Kraft in N`, `torque_nm`, `acc_ms2`, `Force %MVC`.
 
     What stands behind the name without brackets counts as its unit if the name says that it holds
-    that quantity. So `acc_g` has a unit, and `trial_g` has none.
+    that quantity. So `acc_g` has a unit, and `trial_g` has none. A name may be a unit: `%MVC`.
     """
     for found in _BRACKETS.finditer(name):
         unit, rest = (found[1] or found[2]).strip(), name[found.end() :].strip()
@@ -203,7 +203,8 @@ def name_and_unit(name: str) -> tuple[str, str | None]:
         head, unit = name[: border.start()], name[border.end() :].strip()
         if head.strip() and _is_unit(unit, head, border[0].strip()):
             return head.strip().casefold(), unit
-    return name.strip().casefold(), None
+    whole = name.strip() if len(name.strip()) > 1 and quantity_of(name) else None
+    return name.strip().casefold(), whole
 
 
 def _is_unit(text: str, head: str, border: str) -> bool:

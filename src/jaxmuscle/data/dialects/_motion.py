@@ -8,7 +8,7 @@ from ._dialect import Above, Block, Dialect, Head, frequency, triples
 
 _LEAD = {0: [], 1: ["Sample"], 2: ["Frame", "Time"]}
 _COUNTERS = ("frame", "sample")
-_PLATE = (("force_", "N"), ("moment_", "N m"), ("cop_", "mm"))
+_UNITS = (("time", "s"), ("force_", "N"), ("moment_", "N m"), ("cop_", "mm"))  # of a plate
 # OpenSim writes SI units; what a column is stands in its name
 _SI = (
     (re.compile(r".*force_?v?[xyz]|.*_v[xyz]"), "N"),
@@ -44,10 +44,13 @@ def _qualisys(above: Above) -> Head | None:
             names = [*lead, *columns]
     if names is None:
         return Head(rate=rate)
-    whole = [f"{name}" for name in names]
-    timed = ["s" if name.casefold() == "time" else "" for name in whole]
+    whole = list(names)
     counters = _counters(whole)
-    units = [unit or ("mm" if points and j not in counters else "") for j, unit in enumerate(timed)]
+    usual = ["mm" if points and j not in counters else "" for j in range(len(whole))]
+    units = [
+        next((unit for start, unit in _UNITS if name.casefold().startswith(start)), other)
+        for name, other in zip(whole, usual, strict=True)
+    ]
     return Head(whole, units, rate, counters=counters)
 
 
