@@ -180,7 +180,9 @@ def _same_csv(target: jm.Target, text: str) -> bool:
     if rows[0][0].replace(".", "").isdigit():  # without its header it is a figure's
         return target.provenance == "digitised"
     names = [cell.lower() for cell in rows[0]]
-    at, of = names.index("frequency_hz"), names.index("proportional_power")
+    # a changed letter may leave a name that other programs give
+    at = next(i for i, name in enumerate(names) if name.startswith(("f", "hz")))
+    of = next(i for i, name in enumerate(names) if i != at and name != "sigma")
     power = {round(min(float(row[at]), 1e9) / 0.390625, 6): float(row[of]) for row in rows[1:]}
     if any(abs(bin - round(bin)) > 0.02 for bin in power):
         return any("interpolated" in notice for notice in target.notices)

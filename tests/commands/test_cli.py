@@ -103,7 +103,7 @@ FILES = {
     ),
     "negative power": (
         {"line3": "1.5625,-0.1"},
-        "line 5: proportional_power -0.1 must be finite and larger than 0",
+        "line 5: power -0.1 must be larger than 0. If it is in dB or a logarithm",
     ),
     "power that is not a number": (
         {"line3": "1.5625,nan"},
@@ -112,8 +112,8 @@ FILES = {
     "unsorted": ({"line3": "0.5,0.1"}, "line 5: frequency 0.5 Hz is out of order; sort"),
     "duplicate": ({"line3": "1.171875,0.1"}, "line 5: frequency 1.17188 Hz appears twice"),
     "unknown column": (
-        "frequency,power\n1,2\n",
-        "line 1: unknown column 'frequency'; did you mean 'frequency_hz'",
+        "frequency_hz,proportional\n1,2\n",
+        "line 1: unknown column 'proportional'; did you mean 'proportional_power'",
     ),
 }
 

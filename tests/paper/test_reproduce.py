@@ -8,7 +8,6 @@ from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 
-import conftest
 import jax
 import numpy as np
 import pages
@@ -125,13 +124,15 @@ EXPECTED = {
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory):
+def done(tmp_path_factory, pytestconfig):
     """The whole command's work, once: what was found, and the folder.
 
     In chunks of eight seeds, so that ensembles of 1, 16 and 32 seeds share a program: a seed is the
     same in any chunk.
     """
     folder = tmp_path_factory.mktemp("reproduce")
+    plugins = pytestconfig.pluginmanager.get_plugins()
+    (conftest,) = [plugin for plugin in plugins if hasattr(plugin, "DRAWN_WHOLE")]
     with pytest.MonkeyPatch.context() as patch:
         for module in (_levels, _numbers, _readings):
             patch.setattr(module, "ensemble", functools.partial(module.ensemble, chunk=8))
