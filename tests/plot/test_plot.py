@@ -23,6 +23,7 @@ from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.plot import _fit as _plot_fit
 from jaxmuscle.plot import _numbers as _plot_numbers
 from jaxmuscle.plot import _steadiness as _plot_steadiness
+from jaxmuscle.plot import _style as _plot_style
 from jaxmuscle.response._characteristics import static_characteristics
 from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import welch_law
@@ -655,6 +656,27 @@ def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
         beside = dots[1].get_xdata()[:, None] - variation.containers[0].lines[0].get_xdata()
         assert np.min(np.abs(beside)) > 0.1
     assert f"{count} trials" in figure.get_suptitle() or count == 1
+
+
+def test_steadiness_without_a_variation_has_no_empty_panel():
+    report = steady(1, "deg/s")
+    for measures in (report.measures, *report.trials.values()):
+        for name in _plot_steadiness.VARIATIONS.values():
+            measures[name].value, measures[name].interval = np.nan, None
+    titles = [ax.get_title(loc="left") for ax in plot.steadiness(report).axes]
+    assert titles == ["Power by band", "Regularity"]
+
+
+def test_a_key_is_no_wider_than_its_figure():
+    figure, ax = plt.subplots(figsize=(_plot_style.COLUMN, 3), layout="constrained")
+    for i in range(4):
+        ax.plot([0, i], label=f"{i}: resonance 2 (all bins), 87 % of power")
+    lines = _plot_style.key(figure)
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    inside = figure.bbox.expanded(1.001, 1.001)
+    assert lines == 4
+    assert inside.x0 <= legend.get_window_extent().x0 <= legend.get_window_extent().x1 <= inside.x1
 
 
 def test_starts_are_drawn_in_the_order_of_where_they_ended():

@@ -12,11 +12,11 @@ import scipy
 from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.cards import Printed
 from jaxmuscle._common.documents import Table, checked, says
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded, probability
-from jaxmuscle.spectra._settings import require
 
 from ._second_order import parts, second_order_shape
 from ._target_fields import frozen

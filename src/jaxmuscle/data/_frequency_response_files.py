@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.text import choices, printable
-from jaxmuscle.spectra._settings import require
 
 from ._frequency_response import COLUMNS, FrequencyResponse
 from ._recording_files import read_table

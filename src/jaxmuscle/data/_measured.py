@@ -272,7 +272,7 @@ def searched_band(quantity: str | None, highest: float) -> tuple[float, float]:
 def _settings_for_band(band: tuple[float, float], highest: float = math.inf) -> SpectrumSettings:
     """Those of recordings, with the bins that say what is smooth about a band."""
     first, last = bins_around(band, RECORDED)
-    seen = min(last, int(min(SEEN * highest / RECORDED.resolution, last)))
+    seen = int(min(SEEN * highest / RECORDED.resolution, last))
     first = first if seen == last else max(1, int(first * seen / last))
     return SpectrumSettings(**AS_RECORDED, first_bin=first, last_bin=max(seen, first))
 

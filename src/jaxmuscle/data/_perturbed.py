@@ -13,11 +13,12 @@ import scipy
 from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.cards import Printed
 from jaxmuscle._common.names import name_of_all
 from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._cross_spectrum import Response, response_of
-from jaxmuscle.spectra._settings import SpectrumSettings, require
+from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._frequency_response import FrequencyResponse
 from ._measure import Measure, normal_interval

@@ -13,10 +13,11 @@ import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._measures import peaks, regularity
-from jaxmuscle.spectra._settings import SpectrumSettings, require
+from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
 from ._measured import AS_RECORDED, FLOATING, MOTIONS, RECORDED, measure_signals

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.text import choices, printable
-from jaxmuscle.spectra._settings import require
 
 from ._recording_outliers import OUTLIERS, find_outliers
 from ._recording_quality import Baseline, filled
@@ -189,7 +189,7 @@ def perturbed_of(
         )
     signal = values(table, names.values())
     found, signal = _sampled(table, signal, force, times, reading)
-    notices = list(found.notices)
+    notices = [*table.notices, *found.notices]
     units, _ = _unit(table, _Choice(force, [force]), reading, notices)
     if units in SCALELESS:
         raise ValueError(
@@ -202,7 +202,6 @@ def perturbed_of(
             " `displacement_units`, as displacement_units='mm'; or, if nothing moved the"
             " insertion, the force alone, as `column`"
         )
-    notices = [*table.notices, *notices]
     source = f"{Path(table.file).name}, columns {force} and {displacement}, {found.rate:.6g} Hz"
 
     def made(whole: np.ndarray, **more: Any) -> Any:

@@ -8,9 +8,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, overload
 
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.inputs import BEYOND, looked_at, most, read_bytes
 from jaxmuscle._common.text import choices
-from jaxmuscle.spectra._settings import require
 
 from ._apart import read_apart
 from ._perturbed import PerturbedRecording
@@ -24,8 +24,8 @@ from ._text_tables import LOOK, TEXT, holds_text
 from .dialects._dialects import EXPORTS
 
 BOOKS = (".xlsx", ".xlsm")
-KINDS = (*TEXT, ".xlsx", ".mat", ".npy", ".npz", ".c3d", ".edf", ".bdf", ".tdms", ".acq", ".smr")
-KINDS = (*KINDS, ".xlsm", ".gz")
+BINARY = (".mat", ".npy", ".npz", ".c3d", ".edf", ".bdf", ".tdms", ".acq", ".smr")
+KINDS = (*TEXT, ".xlsx", *BINARY, ".xlsm", ".gz")
 TARGETS = (".toml", ".json", ".tar")
 ROWS = 90  # that the shortest recording has
 

@@ -10,12 +10,12 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.cards import Printed
 from jaxmuscle._common.files import nulled
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import digits
 from jaxmuscle.spectra._measures import Peaks
-from jaxmuscle.spectra._settings import require
 
 if TYPE_CHECKING:
     import pandas

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-from jaxmuscle.spectra._settings import require
+from jaxmuscle._common.arguments import require
 
 from ._recording_table import Table, bare, find
 from ._units import name_and_unit, seconds
@@ -33,6 +33,7 @@ TOGETHER, PACKETS = 0.1, 0.25  # of an interval: rows of one packet; share of su
 WIDE = 2.5  # intervals that are no jitter any more
 SEEN = 5  # packets before and after a lost one
 FIGURES = 12  # of numbers in messages
+_REMEDY = "give time='none' and `rate`, if the rows are even without these times"
 
 
 class Clock(NamedTuple):
@@ -255,9 +256,6 @@ def _check_rising(table: Table, clock: Clock, raw: Float[np.ndarray, " rows"]) -
         raise ValueError(f"{table.file}: {where} stands still at {raw[0]:g}; {_REMEDY}")
 
 
-_REMEDY = "give time='none' and `rate`, if the rows are even without these times"
-
-
 def _unit_of(
     table: Table,
     clock: Clock,
@@ -284,12 +282,8 @@ def _unit_of(
         if EPOCH[0] <= raw[0] * scale <= EPOCH[1] and rates[unit] >= 1
     ]
     small = [u for u in list(READINGS)[1:] if SLOWEST <= rates[u] <= FASTEST]
-    unit = (
-        (by_rate + dated + small)[0]
-        if not 10 <= rates["s"] <= 1e6 and (by_rate + dated + small)
-        else "s"
-    )
-    unit = by_rate[0] if by_rate else unit
+    as_seconds = 10 <= rates["s"] <= 1e6
+    unit = [*by_rate, *([] if as_seconds else dated + small), "s"][0]
     if not by_rate and rate and usual == 1 and counts:
         return None, [f"column {clock.name} counts the rows: their rate is {rate:g} Hz as asked"]
     asks = counts or (rates["s"] >= 1 and (raw[-1] - raw[0]) <= LASTS)

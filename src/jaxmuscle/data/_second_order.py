@@ -7,8 +7,8 @@ import numpy as np
 import scipy
 from jaxtyping import Complex, Float
 
+from jaxmuscle._common.arguments import require
 from jaxmuscle.spectra._cross_spectrum import Response
-from jaxmuscle.spectra._settings import require
 
 # a delay that is told of: in standard errors, and chi² without it over chi² with it
 SURE, WORSE = 4.0, 2.0

@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 
 from jaxmuscle import plot
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import nulled, write_json
@@ -17,7 +18,6 @@ from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.spectra._bin_law import ENOUGH
 from jaxmuscle.spectra._fluctuations import variance_spectrum
-from jaxmuscle.spectra._settings import require
 
 from ._measure import Measure, likelier_error
 from ._measured import (
@@ -151,7 +151,8 @@ def steadiness(
     band: tuple[float, float] | None = None,
     mvc: float | int | None = None,
 ) -> Steadiness:
-    """How steady a force, torque or displacement is held, or how a limb trembles: variability, power by band, regularity.
+    """How steady a force, torque or displacement is held, or how a limb trembles: variability, power
+    by band, regularity.
     No model is fitted.
 
         print(jm.steadiness(jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()))

@@ -10,12 +10,12 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from msgspec import Meta
 
-from jaxmuscle._common.arguments import is_real
+from jaxmuscle._common.arguments import is_real, require
 from jaxmuscle._common.documents import Table, checked, parsed, says
 from jaxmuscle._common.files import expanded
 from jaxmuscle._common.inputs import looked_at, read_text
 from jaxmuscle._common.text import choices
-from jaxmuscle.spectra._settings import NAMED, require
+from jaxmuscle.spectra._settings import NAMED
 
 from ._recording_choice import Reading
 from ._recording_files import load_recording

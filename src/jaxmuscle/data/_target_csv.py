@@ -150,11 +150,7 @@ def _header(place: str, row: list[str], file: str) -> tuple[list[str], str]:
         if not name:
             raise TargetError(f"{where}: unknown column {cell!r}; {choices(cell, NAMES)}")
         if names.count(name) > 1:
-            raise TargetError(
-                f"{where}: column {cell!r} is {name}, which appears twice; keep one"
-                if cell.casefold() != name
-                else f"{where}: column {name!r} appears twice; keep one"
-            )
+            raise TargetError(f"{where}: column {name!r} appears twice, here as {cell!r}; keep one")
     for name in NAMES[:2]:
         if name not in names:
             raise TargetError(

@@ -7,10 +7,11 @@ from typing import Any, overload
 import numpy as np
 
 from jaxmuscle import plot
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.cards import Card, Shown
 from jaxmuscle._common.names import name_of_all
 from jaxmuscle._common.text import folded
-from jaxmuscle.spectra._settings import SpectrumSettings, require
+from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum
 
 from ._recording import Recording, notices_of, pooled_target, recorded_settings

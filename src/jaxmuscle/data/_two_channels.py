@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from jaxmuscle.spectra._settings import require
+from jaxmuscle._common.arguments import require
 
 from ._as_target import is_recording
 from ._perturbed import PerturbedRecording

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle._common.arguments import count, positive
+from jaxmuscle._common.arguments import count, positive, require
 from jaxmuscle._common.arrays import as_numbers, with_nulls
 from jaxmuscle._common.keys import check_key, key_of, number_of
 from jaxmuscle._common.progress import Tell, nothing
@@ -39,7 +39,7 @@ from jaxmuscle.model._tasks import (
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
-from jaxmuscle.spectra._settings import WINDOW, require, samples_in
+from jaxmuscle.spectra._settings import WINDOW, samples_in
 
 from ._coordinates import Coordinates
 from ._given import check_data, check_named

@@ -36,22 +36,28 @@ def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """
     fig = canvas(ax, (COLUMN, sum(HEIGHTS)))
     grid = fig.add_gridspec(2, 2, height_ratios=HEIGHTS)
-    power, variation, regularity = (
-        fig.add_subplot(grid[place]) for place in ((0, slice(None)), (1, 0), (1, 1))
-    )
+    varied = {
+        words: name
+        for words, name in VARIATIONS.items()
+        if np.isfinite(steadiness.measures[name].value)
+    }  # nothing varies about a mean that is none
+    power = fig.add_subplot(grid[0, :])
     bands = {_range(name): name for name in steadiness.measures if name.startswith("power_")}
     _dots(power, steadiness, bands)
     log_axis(power, "y")
     power.set_xlabel("Frequency (Hz)")
     power.set_ylabel(f"Power ({squared(steadiness.unit).replace('^2', '²')})", parse_math=False)
     power.set_title("Power by band")
-    _dots(variation, steadiness, VARIATIONS, 100.0)
-    variation.set_ylabel("SD (% of the mean)")
-    variation.set_title("Coefficient of variation")
+    if varied:
+        variation = fig.add_subplot(grid[1, 0])
+        _dots(variation, steadiness, varied, 100.0)
+        variation.set_ylabel("SD (% of the mean)")
+        variation.set_title("Coefficient of variation")
+    regularity = fig.add_subplot(grid[1, 1 if varied else slice(None)])
     _dots(regularity, steadiness, REGULARITY)
     regularity.set_ylabel("Value (no unit)")
     regularity.set_title("Regularity")
-    for panel in (variation, regularity):
+    for panel in fig.axes[1:]:
         panel.margins(y=0.1)
         panel.set_ylim(bottom=0, auto=None)
     count = len(steadiness.trials)

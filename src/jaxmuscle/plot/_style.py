@@ -136,7 +136,8 @@ def heading(fig: Figure | SubFigure, words: str, *, bad: str = "") -> int:
 def key(fig: Figure | SubFigure, columns: int = 2, *, plain: bool = False) -> int:
     """One legend below all panels that have none, in which each name stands once; how many lines.
 
-    `plain`, of names that somebody else gave, in which $ is no sign of mathematics.
+    It has fewer columns than asked where it would be wider than the figure. `plain`, of names that
+    somebody else gave, in which $ is no sign of mathematics.
     """
     named = {
         label: handle
@@ -144,17 +145,21 @@ def key(fig: Figure | SubFigure, columns: int = 2, *, plain: bool = False) -> in
         if ax.get_legend() is None
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
-    if named:
-        made = fig.legend(
-            named.values(),
-            named,
-            loc="outside lower center",
-            ncols=columns,
-            frameon=False,
-            columnspacing=1.2,
-        )
-        for text in made.get_texts() if plain else ():
-            text.set_parse_math(False)
+    if not named:
+        return 0
+    made = fig.legend(
+        named.values(),
+        named,
+        loc="outside lower center",
+        ncols=columns,
+        frameon=False,
+        columnspacing=1.2,
+    )
+    for text in made.get_texts() if plain else ():
+        text.set_parse_math(False)
+    if columns > 1 and made.get_window_extent().width > fig.bbox.width:
+        made.remove()
+        return key(fig, columns - 1, plain=plain)
     return -(-len(named) // columns)
 
 

@@ -5,8 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from jaxmuscle._common.arguments import require
+
 from ._bin_law import bin_rows
-from ._settings import SpectrumSettings, require
+from ._settings import SpectrumSettings
 
 LEAST_INPUT = 1e-4  # of the largest density of the input
 FEWEST = 3  # segments times tapers

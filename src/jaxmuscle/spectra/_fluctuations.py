@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Real
 
-from ._settings import require
+from jaxmuscle._common.arguments import require
 
 EDGES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 12.0)  # Hz
 BANDS = {f"band_{low:g}_{high:g}": (low, high) for low, high in itertools.pairwise(EDGES)}

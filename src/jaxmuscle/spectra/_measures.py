@@ -10,9 +10,10 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Real
 
+from jaxmuscle._common.arguments import require
+
 from ._fluctuations import one_record
 from ._neighbours import neighbours
-from ._settings import require
 from ._welch import Spectrum, floating
 
 Reference = Literal["mean", "maximum", "mvc"]

@@ -7,8 +7,10 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
+from jaxmuscle._common.arguments import require
+
 from ._bin_law import draw_powers, welch_law
-from ._settings import SpectrumSettings, require
+from ._settings import SpectrumSettings
 
 DEGREE = 3  # of the polynomial in ln f that a smooth spectrum is, in the logarithm
 WIDTHS = (0.8, 1.2, 1.8, 2.7)  # Hz at half height: from a line, seen through a taper, to a hill

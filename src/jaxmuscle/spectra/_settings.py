@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxmuscle._common.arguments import require as require
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.documents import converted
 from jaxmuscle._common.text import choices

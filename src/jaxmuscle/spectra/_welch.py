@@ -10,11 +10,12 @@ import scipy
 from jaxtyping import Array, Float, Real
 
 from jaxmuscle import plot
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.arrays import is_concrete
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.programs import kept
 
-from ._settings import SpectrumSettings, require, tapers_of
+from ._settings import SpectrumSettings, tapers_of
 
 
 class Spectrum(Shown, eqx.Module):

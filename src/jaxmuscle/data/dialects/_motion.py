@@ -44,14 +44,13 @@ def _qualisys(above: Above) -> Head | None:
             names = [*lead, *columns]
     if names is None:
         return Head(rate=rate)
-    whole = list(names)
-    counters = _counters(whole)
-    usual = ["mm" if points and j not in counters else "" for j in range(len(whole))]
+    counters = _counters(names)
+    usual = ["mm" if points and j not in counters else "" for j in range(len(names))]
     units = [
         next((unit for start, unit in _UNITS if name.casefold().startswith(start)), other)
-        for name, other in zip(whole, usual, strict=True)
+        for name, other in zip(names, usual, strict=True)
     ]
-    return Head(whole, units, rate, counters=counters)
+    return Head(names, units, rate, counters=counters)
 
 
 def _opensim(above: Above) -> Head | None:
@@ -73,8 +72,7 @@ def _trc(data: bytes) -> list[Block] | None:
     """Two rows of settings, then the names of the points and of their coordinates."""
     if not data.startswith(b"PathFileType"):
         return None
-    first, keys, values, *rest = [*data.split(b"\n", 3), b"", b"", b""][:4]
-    del first
+    _, keys, values, *rest = [*data.split(b"\n", 3), b"", b"", b""][:4]
     stated = dict(
         zip(
             cells_of(keys.decode("utf-8", "replace"), "\t"),
