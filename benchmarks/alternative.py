@@ -24,7 +24,7 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._problem import target_variation
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised

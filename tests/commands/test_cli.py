@@ -33,7 +33,7 @@ from jaxmuscle.commands.console import write_fit
 from jaxmuscle.commands.main import app
 from jaxmuscle.paper._claims import claims_json
 from jaxmuscle.paper._verdicts import Row
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.spectra._settings import WINDOW
 
 GRID = 0.390625 * np.arange(1, 31)

@@ -18,7 +18,7 @@ import jaxmuscle as jm
 from jaxmuscle.explorer._facts import bare_table, facts
 from jaxmuscle.explorer._page import MODULES, part_of
 from jaxmuscle.model import Constant, Decay, RampHold, WhiteNoise
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.spectra._settings import WINDOW
 
 TABLE = Path(__file__).with_name("cases.json")

@@ -17,7 +17,7 @@ from jaxmuscle.fits._tables import with_intervals
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._consequences import consequences, consequences_of_rows, expand
 from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._linearised import linearise
 from jaxmuscle.response._transfer import half_power_frequency, half_power_level
 from jaxmuscle.spectra._bin_law import bin_statistics

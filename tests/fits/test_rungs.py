@@ -22,7 +22,7 @@ from jaxmuscle.objective._arguments import DAMPING_SD, FitOptions, planned
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._derived import derived_names
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._linearised import linearised
 from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW

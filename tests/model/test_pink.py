@@ -18,7 +18,7 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.commands.options import NoiseName
 from jaxmuscle.model import _pink_noise as _pink
 from jaxmuscle.model._noises import NOISES
-from jaxmuscle.response._expected import linear_spectrum
+from jaxmuscle.response._expected_moments import linear_spectrum
 from jaxmuscle.response._linearised import linearise
 
 KEY = jax.random.key(23)

@@ -25,7 +25,7 @@ from jaxmuscle.objective._likelihood import (
     measured_bins,
 )
 from jaxmuscle.objective._problem import target_variation
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.spectra._bin_law import bin_rows, trial_samples, welch_law
 from jaxmuscle.spectra._settings import WINDOW
 

@@ -27,7 +27,8 @@ from test_expected import (
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model import Decay, NoiseSum, RampHold
-from jaxmuscle.response._expected import linear_spectrum, noise_variance
+from jaxmuscle.response._expected import noise_variance
+from jaxmuscle.response._expected_moments import linear_spectrum
 from jaxmuscle.response._harmonic_line import harmonic_system
 from jaxmuscle.response._linearised import Linearisation, linearised
 from jaxmuscle.response._second_order import FAINT, negative_coefficients, second_order

@@ -21,14 +21,8 @@ from jaxmuscle.model import Constant, Decay, RampHold
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._problem import Part, target_variation
 from jaxmuscle.response._autocovariance import Autocovariance
-from jaxmuscle.response._expected import (
-    _compiled_response,
-    covariance_operator,
-    expected_moments,
-    expected_powers,
-    lags_of,
-    linear_spectrum,
-)
+from jaxmuscle.response._expected import _compiled_response, covariance_operator, expected_powers, lags_of
+from jaxmuscle.response._expected_moments import expected_moments, linear_spectrum
 from jaxmuscle.response._harmonic_line import _ordinates, line_table
 from jaxmuscle.response._linearised import check_equilibrium, has_response, linearised
 from jaxmuscle.response._transfer import system_of, transfer

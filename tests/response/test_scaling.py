@@ -9,7 +9,7 @@ from compiled import at_once
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.response._expected import expected_moments, linear_spectrum
+from jaxmuscle.response._expected_moments import expected_moments, linear_spectrum
 from jaxmuscle.response._scaling import at_level, relative_variation, scaled
 from jaxmuscle.spectra._settings import WINDOW
 

@@ -11,7 +11,7 @@ import scipy.stats
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import FirstOrderWarning, OperatingPointError
-from jaxmuscle.response._expected import linear_spectrum
+from jaxmuscle.response._expected_moments import linear_spectrum
 from jaxmuscle.response._second_order import FAINT, negative_coefficients, second_order
 
 MOVING = {

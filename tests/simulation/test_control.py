@@ -11,7 +11,7 @@ from compiled import at_once
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._noise import Realisation
-from jaxmuscle.response._expected import linear_spectrum
+from jaxmuscle.response._expected_moments import linear_spectrum
 from jaxmuscle.response._linearised import LinearTask, linearised
 from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid

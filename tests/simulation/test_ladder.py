@@ -10,7 +10,7 @@ from compiled import at_once
 import jaxmuscle as jm
 from jaxmuscle.model import NoiseSum
 from jaxmuscle.model._noise import Realisation
-from jaxmuscle.response._expected import linear_spectrum
+from jaxmuscle.response._expected_moments import linear_spectrum
 from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 

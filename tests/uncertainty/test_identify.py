@@ -29,7 +29,7 @@ from jaxmuscle.objective._likelihood import Likelihood, without_offsets
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.objective._scoring import maximise
 from jaxmuscle.response._equilibrium import equilibrium
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.spectra._bin_law import samples_of, welch_law
 from jaxmuscle.spectra._settings import WINDOW
 from jaxmuscle.uncertainty import _identifiability

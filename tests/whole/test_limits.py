@@ -10,7 +10,7 @@ from compiled import kept_jit
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._linearised import linearise
 from jaxmuscle.spectra._settings import WINDOW
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxmuscle._common.errors import SimulationError
-from jaxmuscle.response._expected import linear_spectrum
+from jaxmuscle.response._expected_moments import linear_spectrum
 
 from ._arrays import region_of, variables_of
 from ._layout import Chunk, Layout, Pace, run_chunks

@@ -27,7 +27,8 @@ from jaxmuscle.objective._starts import (
     frequency_names,
     harmonic_frequencies,
 )
-from jaxmuscle.response._expected import Moments, expected_moments
+from jaxmuscle.response._expected import Moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import BinStatistics, recorded_interval, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
@@ -94,8 +95,7 @@ def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Momen
         variance = expected.variance + variance - beside.filtered(settings).var(axis=1)
     line = np.zeros_like(power) if expected is None else np.broadcast_to(expected.line, power.shape)
     mean = held.mean(axis=1)
-    unknown = np.full_like(mean, np.nan)
-    return Moments(power, line, mean, variance, unknown, unknown), expected
+    return Moments(power, line, mean, variance), expected
 
 
 def seen_best(objective: Residuals, minima: Minima) -> Expansion:
@@ -160,9 +160,11 @@ def polish_notices(check: dict[str, float | int]) -> tuple[str, ...]:
     )
 
 
-def unsettled(problem: FitProblem, moments: Moments) -> float:
-    """Share of an input's rise that is left when the analysed window begins."""
-    return float(np.exp(-float(moments.rate) * (WINDOW[0] - RISEN))) if problem.control else 0.0
+def unsettled(problem: FitProblem, corner: float) -> float:
+    """Share of an input's rise that is left when the analysed window begins, by the corner
+    frequency [Hz]."""
+    rate = 2 * np.pi * corner
+    return float(np.exp(-rate * (WINDOW[0] - RISEN))) if problem.control else 0.0
 
 
 def rivals(

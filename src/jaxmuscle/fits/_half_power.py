@@ -6,19 +6,12 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxmuscle._common.programs import kept
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._consequences import Expansion, expand
-from jaxmuscle.objective._coordinates import Coordinates, task_at
-from jaxmuscle.objective._moment_models import Linear
+from jaxmuscle.objective._consequences import Expansion, expand, half_power_levels
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
-from jaxmuscle.response._equilibrium import mechanics
-from jaxmuscle.response._linearised import linearise
-from jaxmuscle.response._transfer import half_power_level
 
 from ._intervals import HELD, MOST, REACH, Interval, Point, chosen_rows, held_step, renewed
 
@@ -262,32 +255,8 @@ def _levels_of(
     """`ln(2 |H(f)|² / |H(0)|²)` of one part at every row's frequencies [ln Hz], and its slopes with
     respect to θ.
 
-    It is zero where f is the half-power frequency, in a fit that was corrected by simulation the
-    corrected one.
+    It is zero where f is the half-power frequency.
     """
-    model = objective.parts[part].model
-    shift = float(np.log(model.correction.half)) if isinstance(model, Linear) else 0.0
-    own = objective.parts[part]
-    levels, slopes = _levels(
-        mechanics(own.task), own.coordinates, np.asarray(objective.own(theta, part)), log_f - shift
-    )
-    return np.asarray(levels), objective.spread(np.asarray(slopes), part)
-
-
-@kept
-def _levels(
-    task: AbstractTask,
-    coordinates: Coordinates,
-    theta: Float[Array | np.ndarray, "rows own"],
-    log_f: Float[Array | np.ndarray, "rows points"],
-) -> tuple[Any, Any]:
-    def one(theta, log_f):
-        def levels(theta):
-            there = task_at(task, coordinates, theta)
-            levels = half_power_level(there, linearise(there), log_f)
-            return levels, levels
-
-        slopes, levels = jax.jacfwd(levels, has_aux=True)(theta)
-        return levels, slopes
-
-    return jax.lax.map(lambda row: one(*row), (theta, log_f))  # compiled faster than all at once
+    own = np.asarray(objective.own(theta, part))
+    levels, slopes = half_power_levels(objective.parts[part], own, log_f)
+    return levels, objective.spread(slopes, part)

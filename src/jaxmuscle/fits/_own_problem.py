@@ -187,7 +187,7 @@ class Problem(Shown):
         found = []
         for part in self.objective.parts:
             assert isinstance(part.model, Linear)
-            found.append(part.model.compared(task_at(part.task, part.coordinates, scaled)))
+            found.append(part.model.moments(task_at(part.task, part.coordinates, scaled)))
         return tuple(found)
 
     def _card(self) -> Card:

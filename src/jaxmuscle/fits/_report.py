@@ -19,7 +19,8 @@ from jaxmuscle.objective._derived import jackknife, observed
 from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.objective._starts import PEAK
-from jaxmuscle.response._expected import Moments, check_power, expected_moments
+from jaxmuscle.response._expected import Moments, check_power
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._linearised import settled
 from jaxmuscle.response._second_order import negative_coefficients, second_order
 from jaxmuscle.simulation._simulate import simulate
@@ -323,7 +324,7 @@ def _parts(
                 target,
                 statistics,
                 check | polish,
-                unsettled(plan.problem, moments),
+                unsettled(plan.problem, float(ended.found.values[i]["corner_frequency"])),
                 plan.problem.method,
             ),
             *further_notices(further),

@@ -1,34 +1,27 @@
 """What follows from a point θ: moments and derived quantities with their slopes, residuals."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
+from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
-from jaxmuscle.model._parameters import USUALLY_FREE
+from jaxmuscle.model._parameters import paths_of, set_parameters
+from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
+from jaxmuscle.response._rows import Near, mechanical_rows, value_and_slopes
+from jaxmuscle.response._transfer import half_power_level
 
-from ._coordinates import Coordinates, task_at
-from ._derived import derived
+from ._derived import derived_names, of_muscle, of_spectrum
 from ._moment_models import Linear
-from ._residuals import PartResiduals, Residuals
-
-
-def frequency_of(part: PartResiduals) -> Float[Array, " bins"]:
-    """Frequencies of the compared bins [Hz]."""
-    return jnp.asarray(part.task.settings.frequency)[part.model.chosen]
-
+from ._residuals import Data, PartResiduals, Residuals, data_residuals, free_size
 
 BATCH = 32
-# free with a known mean force, with a moved insertion and in designs, mostly together
-SOMETIMES = ("P_w", "m_w", "m_z")
-POINTS = 128
-LATEST = 4
 
 
 class Expansion(NamedTuple):
@@ -49,6 +42,14 @@ class Expansion(NamedTuple):
             lambda value, slope: value + slope @ (theta - self.theta), self.moments, self.slopes
         )
 
+    def compared(self, wide: Callable[[np.ndarray], np.ndarray]) -> "Expansion":
+        """What residuals follow from, with coordinates made `wide`; a leading axis of points."""
+        moments, slopes = (
+            tuple(part._replace(resonant=()) for part in parts)
+            for parts in (self.moments, self.slopes)
+        )
+        return Expansion(wide(self.theta), moments, jax.tree.map(wide, slopes))
+
     def row(self, i: int) -> "Expansion":
         """At one of the points."""
         return jax.tree.map(lambda x: np.asarray(x)[i], self)
@@ -67,30 +68,8 @@ Tables = tuple[dict[str, np.ndarray], ...]
 def quantities(objective: Residuals, seen: Expansion) -> tuple[Tables, Tables]:
     """Derived quantities of every part, rows where the model was seen, and their slopes with
     respect to θ."""
-    found = [
-        jax.tree.map(np.asarray, _quantities(part, part_of(objective, seen, i)))
-        for i, part in enumerate(objective.parts)
-    ]
-    spread = objective.spread  # asked for once: every time it makes an object
-    slopes = tuple(
-        {n: spread(g, i) for n, g in slopes.items()} for i, (_, slopes) in enumerate(found)
-    )
-    return tuple(values for values, _ in found), slopes
-
-
-@kept
-def _quantities(part: PartResiduals, seen: Expansion) -> tuple[dict[str, Array], dict[str, Array]]:
-    def one(seen):
-        def everything(theta):
-            values = derived(
-                task_at(part.task, part.coordinates, theta), seen.near(theta), frequency_of(part)
-            )
-            return values, values
-
-        slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)
-        return values, slopes
-
-    return jax.lax.map(one, seen)
+    found = consequences_of_rows(objective, seen)
+    return found.values, found.slopes
 
 
 class Consequences(NamedTuple):
@@ -104,173 +83,218 @@ class Consequences(NamedTuple):
 
 
 def consequences(objective: Residuals, seen: Expansion) -> Consequences:
-    """What follows at the point where the model was seen; slopes with respect to θ. By the program
-    of `BATCH` points."""
-    rows = jax.tree.map(lambda x: np.broadcast_to(x, (BATCH, *np.shape(x))), seen)
+    """What follows at the point where the model was seen; slopes with respect to θ."""
+    rows = jax.tree.map(lambda x: np.asarray(x)[None], seen)
     return jax.tree.map(lambda x: x[0], consequences_of_rows(objective, rows))
 
 
 def consequences_of_rows(objective: Residuals, seen: Expansion) -> Consequences:
     """The same at every point where it was seen, with a leading axis of points."""
-    found = [
-        jax.tree.map(np.asarray, _consequences(part, part_of(objective, seen, i)))
-        for i, part in enumerate(objective.parts)
-    ]
+    found = [_of_part(part, part_of(objective, seen, i)) for i, part in enumerate(objective.parts)]
     spread = objective.spread  # asked for once: every time it makes an object
     return Consequences(
-        np.concatenate([values[0] for values, _ in found], axis=1),
-        np.concatenate([spread(slopes[0], i) for i, (_, slopes) in enumerate(found)], axis=1),
-        tuple(values[1] for values, _ in found),
-        tuple(
-            {n: spread(g, i) for n, g in slopes[1].items()} for i, (_, slopes) in enumerate(found)
-        ),
+        np.concatenate([rows for rows, *_ in found], axis=1),
+        np.concatenate([spread(slopes, i) for i, (_, slopes, *_) in enumerate(found)], axis=1),
+        tuple(values for *_, values, _ in found),
+        tuple({n: spread(g, i) for n, g in slopes.items()} for i, (*_, slopes) in enumerate(found)),
     )
 
 
+def _of_part(
+    part: PartResiduals, seen: Expansion
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Data residuals and derived quantities of a part, each with its slopes."""
+    values, slopes = part.coordinates.values_of(seen.theta), part.coordinates.slope
+    known, along = _parameters(part.task, part.coordinates.names, values)
+    muscle, by_muscle = _of_muscles(part, values)
+    along |= by_muscle
+    along = {name: x * slopes(values) for name, x in along.items()}
+    (residuals, spectral), (jacobian, by_spectrum) = _of_spectra(part, seen, known)
+    found, along = known | muscle | spectral, along | by_spectrum
+    names = derived_names(part.task)
+    return (
+        residuals,
+        jacobian,
+        {name: found[name] for name in names},
+        {name: along[name] for name in names},
+    )
+
+
+_PARAMETERS = {
+    ("activation", "time"): "contraction_time",
+    ("harmonic", "frequency"): "harmonic_frequency",
+}
+
+
+def _parameters(
+    task: AbstractTask, names: tuple[str, ...], values: Float[np.ndarray, "rows own"]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Derived quantities that are parameters, and their slopes with respect to the natural
+    values."""
+    here = [
+        ("noise",) if noise is task.noise else ("noise", "parts", i)
+        for i, noise in enumerate(task.noise.components)
+        if isinstance(noise, ResonantNoise)
+    ]
+    wanted = dict(_PARAMETERS)
+    for place, which in zip(here, ("resonance", "resonance_2"), strict=False):
+        wanted |= {(*place, what): f"{which}_{what}" for what in ("frequency", "width")}
+    found, slopes = {}, {}
+    for name, path in paths_of(task).items():
+        if (quantity := wanted.get(path)) is not None:
+            own = np.array(names) == name
+            constant = np.full(len(values), float(task[name]))
+            found[quantity] = values[:, names.index(name)] if name in names else constant
+            slopes[quantity] = np.broadcast_to(own.astype(float), values.shape)
+    return found, slopes
+
+
+def _of_muscles(
+    part: PartResiduals, values: Float[np.ndarray, "rows own"]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """`of_muscle` in every row, and the slopes with respect to the natural values."""
+    model = part.model
+    mean = model.correction.mean if isinstance(model, Linear) else 1.0
+    scale = np.full(len(values), mean)
+    found, slopes = mechanical_rows(_muscles, part.task, part.coordinates.names, values, scale)
+    if not (isinstance(model, Linear) or model.control):  # no linear response
+        found["half_power_frequency"] = np.full(len(values), np.nan)
+    return found, slopes
+
+
 @kept
-def _consequences(part: PartResiduals, seen: Expansion) -> tuple[Any, Any]:
-    def one(seen):
-        def everything(theta):
-            moments = seen.near(theta)
-            task = task_at(part.task, part.coordinates, theta)
-            values = (
-                part.data_residuals(moments, part.data),
-                derived(task, moments, frequency_of(part)),
+def _muscles(
+    task: AbstractTask, names: tuple[str, ...], near: Near, time: Array, scale: Array
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    def one(near, time, scale):
+        def found(both):
+            there = set_parameters(task, dict(zip(names, both[:-1], strict=True)))
+            system = near.at(both[:-1])
+            return of_muscle(there, system, both[-1], system.rest * scale)
+
+        return value_and_slopes(found, jnp.append(near.values, time))
+
+    return jax.vmap(one)(near, time, scale)
+
+
+def half_power_levels(
+    part: PartResiduals,
+    theta: Float[np.ndarray, "rows own"],
+    log_f: Float[np.ndarray, "rows points"],
+) -> tuple[Float[np.ndarray, "rows points"], Float[np.ndarray, "rows points own"]]:
+    """`half_power_level` at every row's frequencies [ln Hz], and its slopes with respect to θ."""
+    values = part.coordinates.values_of(theta)
+    levels, slopes = mechanical_rows(_levels, part.task, part.coordinates.names, values, log_f)
+    return levels, slopes * part.coordinates.slope(values)[:, None]
+
+
+@kept
+def _levels(
+    task: AbstractTask, names: tuple[str, ...], near: Near, time: Array, log_f: Array
+) -> tuple[Array, Array]:
+    def one(near, time, log_f):
+        def found(both):
+            there = set_parameters(task, dict(zip(names, both[:-1], strict=True)))
+            return half_power_level(near.at(both[:-1]), there.muscle.base()[0], both[-1], log_f)
+
+        return value_and_slopes(found, jnp.append(near.values, time))
+
+    return jax.vmap(one)(near, time, log_f)
+
+
+def _of_spectra(
+    part: PartResiduals, seen: Expansion, known: dict[str, np.ndarray]
+) -> tuple[tuple[np.ndarray, Any], tuple[np.ndarray, Any]]:
+    """Data residuals and `of_spectrum` in every row, and their slopes with respect to θ: by a
+    program for `BATCH` rows, two resonances, and as many coordinates as fits share."""
+    count, free = seen.theta.shape
+    peaks = [
+        known.get(f"{which}_frequency", np.zeros(count)) for which in ("resonance", "resonance_2")
+    ]
+    last = np.minimum(np.arange(-(-count // BATCH) * BATCH), count - 1)
+
+    def filled(moments: Moments, *shape: int) -> Moments:
+        none = np.zeros((count, len(part.model.chosen), *shape))
+        resonant = (*moments.resonant, none, none)[:2]
+        return moments._replace(resonant=resonant)
+
+    more = free_size(free) - free
+    slopes = jax.tree.map(
+        lambda x: np.pad(x, [*[(0, 0)] * (np.ndim(x) - 1), (0, more)]), filled(seen.slopes, free)
+    )
+    rows = jax.tree.map(
+        lambda x: np.asarray(x)[last], (filled(seen.moments), slopes, np.stack(peaks, axis=1))
+    )
+    settings = part.task.settings
+    given = as_arrays((settings.frequency[part.model.chosen], settings.resolution))
+    found = [
+        _spectra(
+            part.residual, part.data, *given, *jax.tree.map(lambda x, i=i: x[i : i + BATCH], rows)
+        )
+        for i in range(0, len(last), BATCH)
+    ]
+    values, slopes = jax.tree.map(lambda *x: np.concatenate(x)[:count], *found)
+    return values, jax.tree.map(lambda x: x[..., :free], slopes)
+
+
+@kept
+def _spectra(
+    residual: str,
+    data: Data,
+    frequency: Float[Array, " bins"],
+    resolution: Float[Array, ""],
+    moments: Moments,
+    slopes: Moments,
+    peaks: Float[Array, "rows resonances"],
+) -> tuple[Any, Any]:
+    def one(moments, slopes, peaks):
+        def found(away):
+            near = jax.tree.map(lambda x, slope: x + slope @ away, moments, slopes)
+            return (
+                data_residuals(residual, near, data),
+                of_spectrum(near, frequency, resolution, peaks),
             )
-            return values, values
 
-        slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)
-        return values, slopes
+        return value_and_slopes(found, jnp.zeros(slopes.power.shape[-1]))
 
-    return jax.lax.map(one, seen)
-
-
-class _Response(eqx.Module):
-    """What the moments of a linear response depend on, and nothing else, so that a program is used
-    again."""
-
-    model: Linear
-    task: AbstractTask
-    coordinates: Coordinates
-
-    def moments(self, theta: Float[Array, " free"]) -> Moments:
-        return self.model.moments(task_at(self.task, self.coordinates, theta))
+    return jax.vmap(one)(moments, slopes, peaks)
 
 
 @kept
 def _moments_and_slopes(
     part: Any, theta: Float[Array | np.ndarray, "points free"]
 ) -> tuple[Any, Any]:
-    return jax.vmap(lambda theta: _with_slopes(part, theta))(theta)
+    return jax.vmap(lambda theta: value_and_slopes(part.moments, theta))(theta)
 
 
-@eqx.filter_jit  # traced once, though asked for its shape, too
-def _with_slopes(part: Any, theta: Float[Array, " free"]) -> tuple[Any, Any]:
-    def twice(theta):
-        moments = part.moments(theta)
-        return moments, moments
-
-    slopes, moments = jax.jacfwd(twice, has_aux=True)(theta)
-    return moments, slopes
-
-
-@kept
-def _of_rows(
-    part: Any, theta: Float[Array | np.ndarray, "points free"], count: Any
-) -> tuple[Any, Any]:
-    """Moments and slopes of the first `count` points, one after the other; zeros for the others,
-    which so take no time.
-
-    Two mapped at once would run a fifth faster, and take a third longer to trace and to compile.
-    """
-
-    def put(i: Any, found: Any) -> Any:
-        new = _with_slopes(part, jax.lax.dynamic_index_in_dim(theta, i, keepdims=False))
-        return jax.tree.map(
-            lambda all, new: jax.lax.dynamic_update_index_in_dim(all, new, i, 0), found, new
-        )
-
-    one = jax.eval_shape(_with_slopes, part, theta[0])
-    nothing = jax.tree.map(lambda x: jnp.zeros((len(theta), *x.shape), x.dtype), one)
-    return jax.lax.fori_loop(0, count, put, nothing)
-
-
-def expand(objective: Any, theta: Float[np.ndarray, "points free"]) -> Expansion:
-    """The moments of every part and their slopes at every θ, as numbers.
-
-    Part by part: each has the program of a fit alone. (One program of two kinds of task hangs under
-    jaxlib 0.10.2.)
-    """
+def expand(
+    objective: Any, theta: Float[np.ndarray, "points free"], *, slopes: bool = True
+) -> Expansion:
+    """The moments of every part and their slopes at every θ, as numbers; without `slopes` these are
+    not computed, and zero."""
     each = [
-        _expanded(part, np.asarray(objective.own(theta, i)))
+        _expanded(part, np.asarray(objective.own(theta, i)), slopes)
         for i, part in enumerate(objective.parts)
     ]
     spread = objective.spread  # asked for once: every time it makes an object
-    slopes = tuple(
+    along = tuple(
         jax.tree.map(lambda g, i=i: spread(g, i), slopes) for i, (_, slopes) in enumerate(each)
     )
-    return Expansion(theta, tuple(moments for moments, _ in each), slopes)
+    return Expansion(theta, tuple(moments for moments, _ in each), along)
 
 
-def _expanded(part: Any, theta: Float[np.ndarray, "points own"]) -> tuple[Any, Any]:
-    """Moments of one part and their slopes.
-
-    A linear response is computed for at most `POINTS` points at a time and with slopes also for
-    what a fit usually leaves free, so that one compiled program serves any number of points and
-    nearly any choice of free parameters; a Monte Carlo simulation for all points together, with the
-    slopes that are asked for.
-    """
+def _expanded(
+    part: PartResiduals, theta: Float[np.ndarray, "points own"], slopes: bool
+) -> tuple[Any, Any]:
+    """Moments of one part and their slopes: a linear response by the programs that all share, a
+    Monte Carlo simulation for all points together."""
     if not isinstance(part.model, Linear):
         return jax.tree.map(np.asarray, _moments_and_slopes(part, theta))
-    count, (response, own) = len(theta), _response_of(part, part.model)
-    padded = np.zeros((-(-count // POINTS) * POINTS, len(response.coordinates.names)))
-    padded[:, own] = np.concatenate(
-        [theta, np.broadcast_to(theta[-1], (len(padded) - count, len(own)))]
-    )
-    parts = [
-        _of_rows(response, padded[i : i + POINTS], np.asarray(min(count - i, POINTS)))
-        for i in range(0, count, POINTS)
-    ]
-    moments, slopes = jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
-    return moments, jax.tree.map(lambda slope: slope[..., own], slopes)
-
-
-_LATEST: list[tuple[Any, tuple[_Response, np.ndarray]]] = []
-
-
-def _response_of(part: PartResiduals, model: Linear) -> tuple[_Response, Int[np.ndarray, " own"]]:
-    """What is expanded of a part, and where its own coordinates stand in that; of the latest parts
-    made only once."""
-    for known, found in _LATEST:
-        if known is part:
-            return found
-    wide = _with_the_usual(part.coordinates, part.task)
-    own = np.array([wide.names.index(name) for name in part.coordinates.names], dtype=int)
-    found = _Response(model, part.task, wide), own
-    _LATEST[:] = [(part, found), *_LATEST[: LATEST - 1]]
-    return found
-
-
-def _with_the_usual(coordinates: Coordinates, task: AbstractTask) -> Coordinates:
-    """The coordinates and those of what is usually free, in one order whatever is asked for: θ = 0
-    is the task's value.
-
-    All of `SOMETIMES` are there if one is asked for: a fit with a mean force and a design then
-    share a program.
-    """
-    known, own = task.parameter_names, coordinates.names
-    usual = (*USUALLY_FREE, *(SOMETIMES if any(name in own for name in SOMETIMES) else ()))
-    names = tuple(dict.fromkeys([*(name for name in usual if name in known), *own]))
-    given = {name: i for i, name in enumerate(own)}
-    rows = [
-        (
-            (coordinates.centre[given[n]], coordinates.sd[given[n]], coordinates.positive[given[n]])
-            if n in given
-            else (float(task[n]), 1.0, False)
-        )
-        for n in names
-    ]
-    centre, sd, positive = (np.array(column) for column in zip(*rows, strict=True))
-    return Coordinates(
-        names, centre, sd, positive, np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    names, values = part.coordinates.names, part.coordinates.values_of(theta)
+    moments, along = part.model.of_rows(part.task, names, values, names if slopes else ())
+    if not slopes:
+        return moments, jax.tree.map(lambda x: np.zeros((*np.shape(x), len(names))), moments)
+    stretch = part.coordinates.slope(values)
+    return moments, jax.tree.map(
+        lambda x: x * stretch.reshape(len(values), *[1] * (x.ndim - 2), -1), along
     )

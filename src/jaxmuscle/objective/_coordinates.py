@@ -63,6 +63,21 @@ class Coordinates(eqx.Module):
             tuple(values), centre, sd, positive, *_both_or_none(np.array(low), np.array(high))
         )
 
+    def filled(self, more: int) -> "Coordinates":
+        """With so many further ones that are unbounded, and without names."""
+
+        def wider(x: np.ndarray, value: float) -> np.ndarray:
+            return np.pad(x, (0, more), constant_values=value)
+
+        return Coordinates(
+            (),
+            wider(self.centre, 0.0),
+            wider(self.sd, 1.0),
+            wider(self.positive, 0.0),
+            wider(self.low, -np.inf),
+            wider(self.high, np.inf),
+        )
+
     def theta(self, s: Numbers) -> Numbers:
         """Coordinates in standard deviations of the prior."""
         xp, sigmoid = self._library(s)

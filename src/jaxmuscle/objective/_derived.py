@@ -8,13 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import Muscle
-from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.model._parameters import BASE, PARAMETERS
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._signals import AbstractSignal
 from jaxmuscle.model._tasks import PrescribedLength
-from jaxmuscle.response._equilibrium import HOLD
+from jaxmuscle.response._equilibrium import HOLD, slowest
 from jaxmuscle.response._expected import Moments
+from jaxmuscle.response._linearised import Linearisation
+from jaxmuscle.response._transfer import half_power_frequency
 from jaxmuscle.spectra._fluctuations import BANDS, EDGES, in_bands
 
 TANGENTS = ("K_w_tangent", "tangent_stiffness")
@@ -144,58 +147,42 @@ def tangents(task: Any, mean: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
     return {"K_w_tangent": active, "tangent_stiffness": slope * active / (active + passive)}
 
 
-def derived(
-    task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " bins"] | None = None
-) -> dict[str, Any]:
-    """What the data can determine.
+def of_muscle(
+    task: Any, system: Linearisation, time: Scalar, mean: Scalar
+) -> dict[str, Float[Array, ""]]:
+    """What follows from the mechanics of a bare task, the contraction time T of its activation (0:
+    none) and its mean output: `corner_frequency` |λ_slow|/2π of the operating point;
+    `half_power_frequency` of the slow part, relaxation and activation together; the base
+    coefficients; where the insertion is moved `tangents`."""
+    base = task.muscle.base()
+    found = dict(zip(BASE, base, strict=True))
+    found["corner_frequency"] = slowest(system.A) / (2 * jnp.pi)
+    found["half_power_frequency"] = half_power_frequency(system, base[0], time)
+    return found | (tangents(task, mean) if has_tangents(task) else {})
 
-    `corner_frequency` |λ_slow|/2π of the operating point; `half_power_frequency` of the slow part,
-    relaxation and activation together; `contraction_time`, where there is an activation; where
-    there is a resonance `resonance_frequency`, `resonance_width` and `resonance_share` of the
-    compared power, and `resonance_2_share` of a second one, both from half the resonance's
-    frequency on (what activation and muscle let through below is no peak and can hardly be told
-    from the rest); `harmonic_share` of the compared power; `harmonic_frequency`; the base
-    coefficients; where the insertion is moved `tangents`; `model_coefficient_of_variation` and
-    `model_mean` of the output (not of an acceleration, whose mean is zero, and which has no
-    `half_power_frequency`); `band_4_8` and so on, the proportional power from 4 to 8 Hz, of bins at
-    the edges the part that lies inside, where the bins cover half of the band.
+
+def of_spectrum(
+    moments: Moments,
+    frequency: Float[Array | np.ndarray, " bins"],
+    resolution: Scalar,
+    peaks: Float[Array, " resonances"],
+) -> dict[str, Float[Array, ""]]:
+    """What follows from moments at the compared bins.
+
+    `resonance_share` of the compared power, and `resonance_2_share` of a second one, `peaks` their
+    frequencies, both from half the resonance's frequency on (what activation and muscle let through
+    below is no peak and can hardly be told from the rest); `harmonic_share` of the compared power;
+    `model_coefficient_of_variation` and `model_mean` of the output; `band_4_8` and so on, the
+    proportional power from 4 to 8 Hz, of bins at the edges the part that lies inside.
     """
-    base, seen = task.muscle.base(), observed(moments)
-    # of the bins, if not all are compared
-    at: Any = task.settings.frequency if frequency is None else frequency
-    resonances = [noise for noise in task.noise.components if isinstance(noise, ResonantNoise)]
-    whole, one = moments.power.sum(), jnp.ones(())
-    found: dict[str, Any] = {
-        "corner_frequency": moments.rate / (2 * jnp.pi),
-        "half_power_frequency": moments.half,
+    at, whole = jnp.asarray(frequency, moments.power.dtype), moments.power.sum()
+    names = ("resonance_share", "resonance_2_share")
+    found = {
+        name: jnp.sum(jnp.where(at >= 0.5 * peak, own, 0.0)) / whole
+        for name, peak, own in zip(names, peaks, moments.resonant, strict=False)
     }
-    if task.activation is not None:
-        found["contraction_time"] = task.activation.time * one
-    for name, noise, own in zip(
-        ("resonance", "resonance_2"), resonances, moments.resonant, strict=False
-    ):
-        if name == "resonance":
-            found |= {
-                "resonance_frequency": noise.frequency * one,
-                "resonance_width": noise.width * one,
-            }
-        peak = at >= 0.5 * jax.lax.stop_gradient(noise.frequency)
-        found[f"{name}_share"] = jnp.sum(jnp.where(peak, own, 0.0)) / whole
-    proportional = moments.power / whole
-    inside = in_bands(jnp.asarray(at, proportional.dtype), task.settings.resolution)
-    found |= dict(zip(BANDS, inside @ proportional, strict=True))
-    found |= {
-        "harmonic_share": seen["harmonic_share"],
-        "harmonic_frequency": task.harmonic.frequency * jnp.ones(()),
-        "K_w0": base[0],
-        "K_z0": base[1],
-        "C_w0": base[2],
-        "C_z0": base[3],
-        VARIATION: seen[VARIATION],
-        MEAN: seen[MEAN],
-    }
-    found |= tangents(task, seen[MEAN]) if has_tangents(task) else {}
-    return {name: value for name, value in found.items() if name in derived_names(task)}
+    found |= dict(zip(BANDS, in_bands(at, resolution) @ (moments.power / whole), strict=True))
+    return found | observed(moments)
 
 
 def observed(moments: Moments) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmuscle._common.programs import kept
 
 from ._consequences import Expansion, expand
+from ._residuals import free_size
 
 SMALL = 1e-3
 STILL = 1e-4
@@ -196,18 +197,25 @@ def least_squares(
     data = jax.tree.map(
         lambda x: np.asarray(x)[last], for_all(objective.data, count) if data is None else data
     )
+    # What the steps take: one program for fits of any task and any free parameters.
+    filled, more = objective.filled(), free_size(free) - free
+
+    def wide(x: np.ndarray) -> np.ndarray:
+        return np.pad(x, [*[(0, 0)] * (x.ndim - 1), (0, more)])
+
     seen = state = None
     for _ in range(max_steps):
         rows = np.flatnonzero(now.active) if batched else np.arange(count)
         objective = prepare(objective, now.ahead[rows])
-        new = expand(objective, np.asarray(objective.theta(now.ahead[rows])))
+        new = expand(objective, np.asarray(objective.theta(now.ahead[rows]))).compared(wide)
         if seen is None:
             seen = jax.tree.map(lambda x: x[last], new)
-            state = _start(objective, data, now.s, seen)
+            state = _start(filled, data, wide(now.s), seen)
         else:
             seen = jax.tree.map(lambda old, x, rows=rows: _put(old, rows, x), seen, new)
-        s, state, ahead, cost, accepted = _step(objective, data, now.s, state, seen)
+        s, state, ahead, cost, accepted = _step(filled, data, wide(now.s), state, seen)
         s, ahead, cost, accepted = map(np.asarray, (s, ahead, cost, accepted))
+        s, ahead = s[:, :free], ahead[:, :free]
         now = now.advanced(s, ahead, cost, accepted, margin)
         report(now.minima(count))
         if not np.any(now.active):

@@ -19,7 +19,8 @@ from jaxmuscle._common.types import Scalar
 from jaxmuscle.data._recording import Recording
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.response._expected import Moments, check_line, expected_moments
+from jaxmuscle.response._expected import Moments, check_line
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._input_response import parts_of_stiffness
 from jaxmuscle.response._linearised import check_inputs
 from jaxmuscle.response._second_order import warn_beyond
@@ -34,7 +35,7 @@ from jaxmuscle.spectra._settings import WINDOW
 
 from ._consequences import Expansion, expand
 from ._problem import FitProblem, target_variation
-from ._residuals import Residuals, further_residuals
+from ._residuals import Residuals, data_residuals, further_residuals
 
 
 def repeated(problem: FitProblem, tasks: Sequence[AbstractTask], count: int) -> tuple[Moments, ...]:
@@ -214,6 +215,10 @@ class Likelihood(eqx.Module):
         )
         return cls(problem.linear(), tuple(bins))
 
+    def filled(self) -> "Likelihood":
+        """With the residuals `filled`, for a program that fits share."""
+        return Likelihood(self.objective.filled(), self.bins)
+
     def at(
         self,
         moments: tuple[Moments, ...],
@@ -228,9 +233,8 @@ class Likelihood(eqx.Module):
     def of_part(self, i: int, moments: Moments, offset: Scalar, bins: Bins | None) -> Scalar:
         """Log density of one target's data and offset."""
         if bins is None:
-            return _gaussian(
-                self.objective.parts[i].data_residuals(moments, self.objective.parts[i].data)
-            )
+            part = self.objective.parts[i]
+            return _gaussian(data_residuals(part.residual, moments, part.data))
         return log_density(bins, moments.power, moments.line, offset) + self.further(i, moments)
 
     def further(self, i: int, moments: Moments) -> Scalar:
@@ -244,7 +248,7 @@ class Likelihood(eqx.Module):
             self.objective.parts, moments, self.bins if bins is None else bins, strict=True
         ):
             if own is None:
-                found += _gaussian(part.data_residuals(m, part.data))
+                found += _gaussian(data_residuals(part.residual, m, part.data))
             else:
                 found += log_marginal(own, m.power, m.line) + _gaussian(
                     further_residuals(m, part.data)
@@ -264,7 +268,7 @@ class Likelihood(eqx.Module):
             def rows(theta, i=i, part=part, own=own):
                 moments = seen.near(theta)[i]
                 return (
-                    part.data_residuals(moments, part.data)
+                    data_residuals(part.residual, moments, part.data)
                     if own is None
                     else further_residuals(moments, part.data)
                 )

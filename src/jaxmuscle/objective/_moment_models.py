@@ -12,11 +12,11 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.response._equilibrium import slowest, slowest_rate
-from jaxmuscle.response._expected import Moments, expected_moments, response
+from jaxmuscle.response._expected import Moments, response
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._input_response import parts_of_stiffness
-from jaxmuscle.response._linearised import Linearisation, LinearTask, settled
-from jaxmuscle.response._transfer import half_power_frequency
+from jaxmuscle.response._linearised import LinearTask, settled
+from jaxmuscle.response._rows import Sampled, moments_of_rows
 from jaxmuscle.simulation._batch import streams_of
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_rows
@@ -65,32 +65,36 @@ class Linear(eqx.Module):
     points: Float[Array | np.ndarray, " points"] | None = None
     recorded: Float[Array | np.ndarray, ""] | float = 0.0
 
-    def compared(self, task: AbstractTask) -> Moments:
-        """Expected moments of the task's output that are compared with data: without rate and
-        half-power frequency.
-
-        Those two have no second derivative.
-        """
-        return self._compared(task)[0]
-
     def moments(self, task: AbstractTask) -> Moments:
-        """Expected moments of the task's output."""
-        found, system = self._compared(task)
-        rate, half = slowest(system.A), half_power_frequency(task, system)
-        return found._replace(rate=rate * self.correction.rate, half=half * self.correction.half)
-
-    def _compared(self, task: AbstractTask) -> tuple[Moments, Linearisation]:
+        """Expected moments of the task's output that are compared with data."""
         # Compiled apart, so that it is traced once.
         found, system = expected_moments(
             task, task.settings, self.window, self.samples, self.recorded
         )
-        power, line, resonant = jax.tree.map(
-            lambda x: x[self.chosen], (found.power, found.line, found.resonant)
+        stiffness = () if self.points is None else parts_of_stiffness(task, system, self.points)
+        return self._chosen(found._replace(stiffness=stiffness), jnp.multiply)
+
+    def of_rows(
+        self,
+        task: AbstractTask,
+        own: tuple[str, ...],
+        values: Float[np.ndarray, "rows own"],
+        along: tuple[str, ...],
+    ) -> tuple[Moments, Moments]:
+        """The same with each row of values, and their slopes along a last axis."""
+        sampled = Sampled(task.settings, self.window, self.samples, self.recorded)
+        moments, slopes, _ = moments_of_rows(task, own, values, sampled, self.points, along)
+        slopes = self._chosen(
+            slopes, lambda x, c: x * np.asarray(c)[..., None], lambda x: x[:, self.chosen]
         )
+        return self._chosen(moments, np.multiply, lambda x: x[:, self.chosen]), slopes
+
+    def _chosen(self, found: Moments, times: Any, pick: Any = None) -> Moments:
+        """At the compared bins, corrected."""
+        pick = (lambda x: x[self.chosen]) if pick is None else pick
+        power, line, resonant = jax.tree.map(pick, (found.power, found.line, found.resonant))
         found = found._replace(power=power, line=line, resonant=resonant)
-        if self.points is not None:
-            found = found._replace(stiffness=parts_of_stiffness(task, system, self.points))
-        return jax.tree.map(jnp.multiply, found, self.correction), system
+        return jax.tree.map(times, found, self.correction)
 
 
 class MonteCarlo(eqx.Module):
@@ -182,15 +186,12 @@ class MonteCarlo(eqx.Module):
             )
             mean, spread = jnp.mean(seen[:, start:stop]), jnp.mean(swing(seen) - swing(beside))
             resonant = tuple(own[self.chosen] for own in exact.resonant)
-            half = half_power_frequency(task, system)
             stiffness = () if self.points is None else parts_of_stiffness(task, system, self.points)
             return Moments(
                 power,
                 exact.line[self.chosen],
                 mean,
                 exact.variance + spread,
-                slowest(system.A),
-                half,
                 resonant,
                 stiffness,
             )
@@ -207,9 +208,7 @@ class MonteCarlo(eqx.Module):
             for part in task.noise.components
             if isinstance(part, ResonantNoise)
         )
-        return Moments(
-            line + random, line, mean, variance, slowest_rate(task), jnp.full((), jnp.nan), none
-        )
+        return Moments(line + random, line, mean, variance, none)
 
     def _power(
         self, outputs: Float[Array, "seeds samples"], settings: SpectrumSettings

@@ -117,7 +117,7 @@ class Part:
             ones for noise in self.task.noise.components if isinstance(noise, ResonantNoise)
         )
         stiffness = () if self.points is None else np.ones((2, len(self.points)))
-        return Moments(ones, ones, one, one, one, one, resonant, stiffness)
+        return Moments(ones, ones, one, one, resonant, stiffness)
 
     def linear(
         self, residual: str, share: np.ndarray | None = None, correction: Moments | None = None

@@ -60,22 +60,27 @@ class PartResiduals(eqx.Module):
         """Moments of the model at its own coordinates."""
         return self.model.moments(task_at(self.task, self.coordinates, theta))
 
-    def data_residuals(self, moments: Moments, data: Data) -> Float[Array, " residuals"]:
-        """Residuals in standard deviations of the data: spectrum, then the further ones."""
-        return jnp.concatenate(
-            [jnp.asarray(self._spectrum_residuals(moments, data)), further_residuals(moments, data)]
-        )
 
-    def _spectrum_residuals(
-        self, moments: Moments, data: Data
-    ) -> Float[Array | np.ndarray, " bins"]:
-        if self.residual == "log":
-            z = jnp.log(data.target) - data.bias - jnp.log(moments.power)
-            return (z - jnp.mean(z)) / data.sd
-        difference = data.target - moments.proportional
-        if self.residual == "linear":
-            return difference / data.sigma
-        return jnp.cumsum(difference)[:-1] / data.sigma[:-1]
+def data_residuals(residual: str, moments: Moments, data: Data) -> Float[Array, " residuals"]:
+    """Residuals in standard deviations of the data: spectrum, then the further ones."""
+    return jnp.concatenate(
+        [
+            jnp.asarray(_spectrum_residuals(residual, moments, data)),
+            further_residuals(moments, data),
+        ]
+    )
+
+
+def _spectrum_residuals(
+    residual: str, moments: Moments, data: Data
+) -> Float[Array | np.ndarray, " bins"]:
+    if residual == "log":
+        z = jnp.log(data.target) - data.bias - jnp.log(moments.power)
+        return (z - jnp.mean(z)) / data.sd
+    difference = data.target - moments.proportional
+    if residual == "linear":
+        return difference / data.sigma
+    return jnp.cumsum(difference)[:-1] / data.sigma[:-1]
 
 
 def further_residuals(moments: Moments, data: Data) -> Float[Array, " rows"]:
@@ -134,7 +139,10 @@ class Residuals(eqx.Module):
     ) -> Float[Array, " residuals"]:
         """Data residuals of all parts, one after the other."""
         return jnp.concatenate(
-            [p.data_residuals(m, d) for p, m, d in zip(self.parts, moments, data, strict=True)]
+            [
+                data_residuals(part.residual, m, d)
+                for part, m, d in zip(self.parts, moments, data, strict=True)
+            ]
         )
 
     def residuals(
@@ -142,6 +150,25 @@ class Residuals(eqx.Module):
     ) -> Float[Array, " all"]:
         """Data residuals of the moments at θ, then those of the prior, which counts once."""
         return jnp.concatenate([self.data_residuals(moments, data), self.prior_root @ theta])
+
+    def filled(self) -> "Residuals":
+        """What residuals follow from once moments are known, with coordinates that nothing depends
+        on: a program of steps that fits share, whatever their tasks and free parameters."""
+        more = free_size(len(self.coordinates.names)) - len(self.coordinates.names)
+        parts = tuple(
+            PartResiduals(None, None, None, p.data, None, p.residual)  # pyright: ignore
+            for p in self.parts
+        )
+        root = np.eye(len(self.prior_root) + more, dtype=self.prior_root.dtype)
+        root[: len(self.prior_root), : len(self.prior_root)] = self.prior_root
+        return Residuals(
+            parts,
+            self.coordinates.filled(more),
+            root,
+            np.pad(self.moving, (0, more), constant_values=1),
+            columns=(),
+            optimiser=self.optimiser,
+        )
 
     def own(
         self, values: Float[Array | np.ndarray, "*rows free"], i: int
@@ -156,6 +183,11 @@ class Residuals(eqx.Module):
         whole = np.zeros((*np.shape(slope)[:-1], len(self.coordinates.names)))
         whole[..., np.array(self.columns[i], dtype=int)] = slope
         return whole
+
+
+def free_size(free: int) -> int:
+    """How many coordinates a shared program has for so many."""
+    return max(-(-free // 8) * 8, 16)
 
 
 def residual_sigma(

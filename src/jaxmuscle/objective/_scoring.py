@@ -14,7 +14,7 @@ from ._consequences import Expansion, expand, quantities
 from ._coordinates import Coordinates
 from ._likelihood import AllBins, Likelihood
 from ._problem import FitProblem
-from ._residuals import Residuals
+from ._residuals import Residuals, free_size
 from ._starts import points_about
 
 STEPS = 60
@@ -162,16 +162,14 @@ def _look(
     """Cost, its slope and curvature with respect to (θ, u), where it is finite."""
     theta = np.asarray(likelihood.objective.coordinates.theta(s))
     seen = expand(likelihood.objective, theta)
-    height, slope, information = (np.array(x) for x in _local(*_padded(likelihood, bins, seen, u)))
-    height, slope, information = height[: len(s)], -slope[: len(s)], information[: len(s)]
     free = s.shape[1]
+    height, slope, information = _heights(likelihood, bins, seen, u)
     pulled = theta @ precision
     cost = -height + 0.5 * np.sum(pulled * theta, axis=1)
     slope[:, :free] += pulled
     information[:, :free, :free] += precision
     if pin is not None:
-        values, slopes = pin.seen(likelihood.objective, _filled(seen, len(s)))
-        values, slopes = values[: len(s)], slopes[: len(s)]
+        values, slopes = pin.seen(likelihood.objective, seen)
         off, rise = (values - pin.value) / pin.width, slopes / pin.width
         cost = cost + 0.5 * off**2
         slope[:, :free] += off[:, None] * rise
@@ -180,10 +178,21 @@ def _look(
     return _Look(height, cost, slope, information)
 
 
-def _padded(
+def _heights(
     likelihood: Likelihood, bins: AllBins, seen: Expansion, u: np.ndarray
-) -> tuple[Any, ...]:
-    return (likelihood, *_filled((bins, seen, u), len(u)))
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`_local` of the negative log likelihood, by a program that fits share."""
+    rows, free = seen.theta.shape
+    size = free_size(free)
+
+    def wide(x: np.ndarray) -> np.ndarray:
+        return np.pad(x, [*[(0, 0)] * (x.ndim - 1), (0, size - free)])
+
+    given = _filled((bins, seen.compared(wide), u), rows)
+    found = _local(likelihood.filled(), *given)
+    height, slope, information = (np.array(x)[:rows] for x in found)
+    own = np.concatenate([np.arange(free), np.arange(size, size + u.shape[1])])
+    return height, -slope[:, own], information[:, own[:, None], own]
 
 
 def _filled(tree: Any, rows: int) -> Any:

@@ -16,7 +16,7 @@ from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._signals import SmoothStep
 from jaxmuscle.model._tasks import AbstractTask, PrescribedForce
 from jaxmuscle.model._white_noise import OrnsteinUhlenbeckNoise
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._presets import load_preset
 from jaxmuscle.simulation._trajectory import Trajectory, stack
 from jaxmuscle.spectra._measures import approximate_entropy, peaks, spearman

@@ -12,7 +12,7 @@ from jaxmuscle.model._parameters import CHANNELS
 from jaxmuscle.model._signals import Harmonic, Sampled
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, PrescribedMotion
 from jaxmuscle.model._white_noise import BandLimitedNoise
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.spectra._measures import peaks
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum

@@ -1,7 +1,7 @@
-"""The autocovariance of a task's sampled output under noise, in linear response and closed form."""
+"""The autocovariance of a task's output in linear response, in closed form, as it is sampled."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,52 +21,38 @@ from ._linearised import Linearisation
 
 SHORT = 4
 KINK = 10  # values of r from lag 0 on that say what its kink does to a sum
+DECAY = 100.0  # 1/s, of states that nothing drives or reads
 
 
-def _sylvester(A: Array, F: Array, Q: Array) -> Array:
-    """X with `A X + X Fᵀ + Q = 0`."""
-    if not Q.size:
-        return Q
-    n, m = A.shape[0], F.shape[0]
-    both = jnp.kron(A, jnp.eye(m, dtype=A.dtype)) + jnp.kron(jnp.eye(n, dtype=A.dtype), F)
-    return jnp.linalg.solve(both, -Q.reshape(n * m)).reshape(Q.shape)
+class Chain(NamedTuple):
+    """Noise through linear systems, one behind the other: `x' = matrix x + white w`, w of density
+    1; each channel reads, with its `row`, an x of its own."""
 
+    matrix: Float[Array, "*parts all all"]
+    white: Float[Array, "*parts all noises"]
+    rows: Float[Array, "*parts channels all"]
 
-class Covariances(NamedTuple):
-    """A linear system without input whose outputs sum to the autocovariance, `r(s) = Σ row
-    exp(matrix s) start`."""
-
-    matrix: Float[Array, "all all"]
-    rows: Float[Array, "channels all"]
-    start: Float[Array, "channels all"]
-
-
-class _Chain:
-    """Linear systems one behind the other, `x' = M x + Γ w`, and the stationary covariance P of
-    their states, built up."""
-
-    def __init__(self, F: Array, G: Array):
-        self.matrix, self.white, self.covariance = F, G, _sylvester(F, F, G @ G.T)
-
-    def add(self, A: Array, inflow: Array, white: Array) -> int:
-        """Another system `y' = A y + inflow x + white w`; where its states begin. Its covariances
-        follow one by one."""
+    def add(self, A: Array, inflow: Array, white: Array) -> "Chain":
+        """With another system behind, `y' = A y + inflow x + white w`."""
         before, n = len(self.matrix), len(A)
-        cross = _sylvester(A, self.matrix, inflow @ self.covariance + white @ self.white.T)
-        fed = inflow @ cross.T
-        inner = _sylvester(A, A, fed + fed.T + white @ white.T)
-        self.matrix = jnp.block([[self.matrix, jnp.zeros((before, n), A.dtype)], [inflow, A]])
-        self.covariance = jnp.block([[self.covariance, cross.T], [cross, inner]])
-        self.white = jnp.concatenate([self.white, white])
-        return before
+        matrix = jnp.block([[self.matrix, jnp.zeros((before, n), A.dtype)], [inflow, A]])
+        rows = jnp.pad(self.rows, ((0, 0), (0, n)))
+        return Chain(matrix, jnp.concatenate([self.white, white]), rows)
 
-    def filled(self, row: Array) -> Array:
-        """A row that reads the first states, with zeros for those that came later."""
-        return jnp.pad(row, (0, len(self.matrix) - len(row)))
+    def filled(self, size: int, noises: int, channels: int) -> "Chain":
+        """The same in a larger shape: with states that nothing drives or reads, and zeros."""
+        (channel, n), noise = self.rows.shape, self.white.shape[1]
+        more = size - n
+        idle = -DECAY * jnp.eye(more, dtype=self.matrix.dtype)
+        return Chain(
+            jax.scipy.linalg.block_diag(self.matrix, idle),
+            jnp.pad(self.white, ((0, more), (0, noises - noise))),
+            jnp.pad(self.rows, ((0, channels - channel), (0, more))),
+        )
 
 
-def covariances(task: AbstractTask, system: Linearisation) -> list[list[Covariances]]:
-    """The stationary response to the noise: of each of its components a sum of independent parts.
+def chains(task: AbstractTask, system: Linearisation) -> list[list[Chain]]:
+    """What the output gets of the noise: of each of its components a sum of independent parts.
 
     The response `C (s - A)⁻¹ b + d + s e` to a scalar noise that acts on several inputs with b, d,
     e each: its states are those of the transposed system, `p' = Aᵀ p + Cᵀ N`, of which every input
@@ -110,57 +96,101 @@ def _of_groups(
     system: Linearisation,
     noise: AbstractNoise,
     groups: list[tuple[bool, list[int]]],
-) -> Covariances:
+) -> Chain:
     """The response to one component of the noise through some of its inputs, in groups: through the
     activation or not."""
     scale = task.noise_scale(noise)
     b, d, e = (x[..., np.array(noise.acts_on)] * scale for x in (system.B, system.D, system.E))
     made: ShapingFilter = jax.tree.map(lambda x: x.astype(b.dtype), noise.shaping_filter())
-    chain, rows = _Chain(made.F, made.G), []
+    chain = Chain(made.F, made.G, jnp.zeros((0, len(made.F)), b.dtype))
     for active, group in groups:
         # What the group gets: a row of the states and one of the white noise.
-        value, white = chain.filled(made.H), made.L
+        value, white = jnp.pad(made.H, (0, len(chain.matrix) - len(made.H))), made.L
         if active and task.activation is not None:
             own, into = (x.astype(b.dtype) for x in task.activation.states())
-            first = chain.add(own, jnp.outer(into, value), jnp.outer(into, white))
+            first = len(chain.matrix)
+            chain = chain.add(own, jnp.outer(into, value), jnp.outer(into, white))
             value, white = jnp.eye(len(chain.matrix), dtype=b.dtype)[first], jnp.zeros_like(white)
         slope = value @ chain.matrix
-        chain.add(system.A.T, jnp.outer(system.C, value), jnp.outer(system.C, white))
-        rows += [jnp.concatenate([d[j] * value + e[j] * slope, b[:, j]]) for j in group]
-    stacked = jnp.stack([chain.filled(row) for row in rows])
-    stacked = jnp.sum(stacked, axis=0, keepdims=True) if noise.shared else stacked
-    return Covariances(chain.matrix, stacked, stacked @ chain.covariance)
+        through = jnp.outer(d[jnp.array(group)], value) + jnp.outer(e[jnp.array(group)], slope)
+        chain = chain.add(system.A.T, jnp.outer(system.C, value), jnp.outer(system.C, white))
+        rows = jnp.concatenate([through, b[:, jnp.array(group)].T], axis=1)
+        chain = chain._replace(rows=jnp.concatenate([chain.rows, rows]))
+    return (
+        chain._replace(rows=jnp.sum(chain.rows, axis=0, keepdims=True)) if noise.shared else chain
+    )
+
+
+def stationary(
+    matrix: Float[Array, "*parts all all"], white: Float[Array, "*parts all noises"]
+) -> Float[Array, "*parts all all"]:
+    """P with `M P + P Mᵀ + Γ Γᵀ = 0`: the covariance of the states. Solved for its upper
+    triangle."""
+    n, eye = matrix.shape[-1], jnp.eye(matrix.shape[-1], dtype=matrix.dtype)
+    i, j = np.triu_indices(n)
+    upper, place = i * n + j, np.zeros((n, n), dtype=int)
+    place[i, j] = place[j, i] = np.arange(len(i))
+    both = (
+        matrix[..., :, None, :, None] * eye[:, None, :]
+        + eye[:, None, :, None] * matrix[..., None, :, None, :]
+    )
+    both = both + jnp.swapaxes(both, -1, -2)  # an entry and its mirror image are one
+    both = both.reshape(*both.shape[:-4], n * n, n * n)[..., upper, :][..., upper]
+    driven = (white @ jnp.swapaxes(white, -1, -2)).reshape(*matrix.shape[:-2], n * n)[..., upper]
+    twice = jnp.asarray(np.where(i == j, 0.5, 1.0), matrix.dtype)
+    return jnp.linalg.solve(both * twice, -driven[..., None])[..., 0][..., place]
+
+
+class Covariances(NamedTuple):
+    """A linear system without input whose outputs sum to the autocovariance, `r(s) = Σ row
+    exp(matrix s) start`."""
+
+    matrix: Float[Array, "*parts all all"]
+    rows: Float[Array, "*parts channels all"]
+    start: Float[Array, "*parts channels all"]
+
+    @classmethod
+    def of(cls, chain: Chain) -> "Covariances":
+        """Where the chain has been driven for ever."""
+        return cls(chain.matrix, chain.rows, chain.rows @ stationary(chain.matrix, chain.white))
+
+
+def covariances(task: AbstractTask, system: Linearisation) -> list[list[Covariances]]:
+    """The stationary response to the noise: of each of its components a sum of independent
+    parts."""
+    return [[Covariances.of(part) for part in own] for own in chains(task, system)]
+
+
+def stacked(parts: list[Chain], size: int = 0, channels: int = 0) -> Chain:
+    """Along a leading axis, filled up to one size (and at least to the given one), so that whatever
+    follows is traced and compiled once, however many there are."""
+    size = max(size, *(len(own.matrix) for own in parts))
+    noises = max(own.white.shape[1] for own in parts)
+    channels = max(channels, *(len(own.rows) for own in parts))
+    return jax.tree.map(lambda *x: jnp.stack(x), *(p.filled(size, noises, channels) for p in parts))
 
 
 class Autocovariance(NamedTuple):
     """r of the sampled output: its first q values, and `r(lΔ) = Σ row powers[0]^(l-q) next` beyond.
 
-    powers[k] = powers[0]^(2^k).
+    powers[k] = powers[0]^(2^k). Of parts along an axis, in powers the second.
     """
 
-    head: Float[Array, " q"]
-    rows: Float[Array, "channels all"]
-    powers: Float[Array, "doublings all all"]
-    next: Float[Array, "channels all"]
+    head: Float[Array, "parts q"]
+    rows: Float[Array, "parts channels all"]
+    powers: Float[Array, "doublings parts all all"]
+    next: Float[Array, "parts all channels"]
 
-    def lagged(self, lags: int) -> Float[Array, " lags"]:
+    def lagged(self, lags: int) -> Float[Array, "parts lags"]:
         """r at lags 0, Δ, 2Δ ...: from few steps to the right and few long ones to the left, which
         meet in one product."""
-        short, (channels, n) = (lags.bit_length() + 1) // 2, self.next.shape
-        columns, rows = self.next.T[:, None], self.rows[None]
-        for power in self.powers[:short]:
-            later = (power @ columns.reshape(n, -1)).reshape(columns.shape)
-            columns = jnp.concatenate([columns, later], axis=1)
-        for power in self.powers[short:]:
-            if rows.shape[0] * columns.shape[1] >= lags - 1:
-                break
-            rows = jnp.concatenate([rows, (rows.reshape(-1, n) @ power).reshape(rows.shape)])
-        later = rows.reshape(-1, channels * n) @ columns.transpose(2, 0, 1).reshape(
-            channels * n, -1
-        )
-        return jnp.concatenate([self.head, later.reshape(-1)])[:lags]
+        short = (lags.bit_length() + 1) // 2
+        long = max((lags - 2).bit_length() - short, 0)
+        columns = _further(self.powers[:short], self.next)
+        rows = _before(self.powers[short : short + long], self.rows)
+        return jnp.concatenate([self.head, _meeting(rows, columns)], axis=1)[:, :lags]
 
-    def mean_variance(self, samples: Int[Array | np.ndarray, ""] | int) -> Float[Array, ""]:
+    def mean_variance(self, samples: Int[Array | np.ndarray, ""] | int) -> Float[Array, " parts"]:
         """Variance of the mean of that many successive samples, `Σ_l 2 (n - l) / n² r(lΔ) + r(0) /
         n`, l = 1 ... n - 1.
 
@@ -168,34 +198,56 @@ class Autocovariance(NamedTuple):
         its bit of n - q is set.
         """
         q, n, zero = (
-            len(self.head),
+            self.head.shape[1],
             jnp.asarray(samples, self.next.dtype),
             jnp.zeros_like(self.next),
         )
         count = jnp.maximum(jnp.asarray(samples) - q, 0)
 
-        def double(sums: Array, block: tuple[Array, Array]) -> tuple[Array, None]:
+        def double(sums: tuple[Array, ...], block: tuple[Array, Array]) -> tuple[Any, None]:
             power, bit = block
             sum_all, rise_all, sum_here, rise_here = sums
             length = (2**bit).astype(n.dtype)
-            moved = jnp.stack(
-                [rise_all + length * sum_all, sum_all, rise_here + length * sum_here, sum_here]
-            )
-            moved = product(moved, power.T)
+            moved = jnp.split(power @ jnp.concatenate(sums, axis=2), 4, axis=2)
             counts = (count >> bit) % 2 == 1  # this block, then what is there already
-            both = jnp.stack([sum_here + moved[1], rise_here + moved[0]])
             return (
-                jnp.concatenate([jnp.where(counts, both, sums[:2]), sums[2:] + moved[:1:-1]]),
-                None,
-            )
+                jnp.where(counts, sum_here + moved[0], sum_all),
+                jnp.where(counts, rise_here + moved[1] + length * moved[0], rise_all),
+                sum_here + moved[2],
+                rise_here + moved[3] + length * moved[2],
+            ), None
 
         bits = jnp.arange(len(self.powers), dtype=count.dtype)
-        sums, _ = jax.lax.scan(
-            double, jnp.stack([zero, zero, self.next, zero]), (self.powers, bits)
-        )
+        sums, _ = jax.lax.scan(double, (zero, zero, self.next, zero), (self.powers, bits))
         lag = jnp.arange(q, dtype=n.dtype)
-        first = jnp.where(lag > 0, 2.0, 1.0) * jnp.maximum(n - lag, 0.0) @ self.head
-        return (first + 2 * jnp.sum(self.rows * ((n - q) * sums[0] - sums[1]))) / n**2
+        first = self.head @ (jnp.where(lag > 0, 2.0, 1.0) * jnp.maximum(n - lag, 0.0))
+        rest = jnp.swapaxes((n - q) * sums[0] - sums[1], 1, 2)
+        return (first + 2 * jnp.sum(self.rows * rest, axis=(1, 2))) / n**2
+
+
+def _further(powers: Array, vectors: Float[Array, "parts all channels"]) -> Array:
+    """Φ^m v, m = 0 ... 2^k - 1, along a last axis, by k powers Φ, Φ², Φ⁴ ..."""
+    found = vectors[..., None]
+    for power in powers:
+        later = (power @ found.reshape(*found.shape[:2], -1)).reshape(found.shape)
+        found = jnp.concatenate([found, later], axis=3)
+    return found
+
+
+def _before(powers: Array, rows: Float[Array, "parts channels all"]) -> Array:
+    """c Φ^m along a second axis."""
+    found = rows[:, None]
+    for power in powers:
+        later = (found.reshape(len(found), -1, found.shape[-1]) @ power).reshape(found.shape)
+        found = jnp.concatenate([found, later], axis=1)
+    return found
+
+
+def _meeting(rows: Array, columns: Array) -> Float[Array, "parts lags"]:
+    """`Σ c Φ^(a + b) v`, all a times all b."""
+    parts, count, channels, n = rows.shape
+    columns = jnp.swapaxes(columns, 1, 2).reshape(parts, channels * n, -1)
+    return (rows.reshape(parts, count, channels * n) @ columns).reshape(parts, -1)
 
 
 class _Folded(NamedTuple):
@@ -250,48 +302,53 @@ def _decimated(
     ones.
     """
     head, coarser, spread = (jnp.asarray(x, start.dtype) for x in _folded())
-    short, long = powers[0].T, powers[SHORT]
-    _, columns = jax.lax.scan(lambda x, _: (x @ short, x), start, length=2**SHORT)
-    blocks = jnp.tensordot(spread[::-1], columns, 1)
-    both = rows, jnp.zeros_like(start)
-    (_, carried), rows = jax.lax.scan(
-        lambda x, block: ((x[0] @ long, x[1] @ long.T + block), x[0]), both, blocks
-    )
-    r = jnp.einsum("acn,bcn->ab", rows, columns).reshape(-1)
+    blocks, long = len(spread), (len(spread) - 1).bit_length()
+    columns = _further(powers[:SHORT], start)
+    r = _meeting(_before(powers[SHORT : SHORT + long], rows)[:, :blocks], columns)
     more = steps**2 * (coarser[0] + steps**2 * coarser[1])
-    return head @ r + more @ r[:KINK], carried
+    later = columns @ jnp.pad(spread, ((0, 2**long - blocks), (0, 0))).T
+    for power in powers[SHORT : SHORT + long]:  # Σ_a Φ^(16 a) of the blocks: of two one
+        odd = later[..., 1::2]
+        later = later[..., ::2] + (power @ odd.reshape(*odd.shape[:2], -1)).reshape(odd.shape)
+    return r @ head.T + r[:, :KINK] @ more.T, later[..., 0]
 
 
-def _autocovariance(
-    system: Covariances, interval: float, lags: int, sampling: str, recorded: Scalar
+def autocovariance(
+    chain: Chain, interval: Scalar, lags: int, sampling: str, recorded: Scalar
 ) -> Autocovariance:
-    """Autocovariance of the sampled output, good for that many lags; not finite where it does not
-    decay. `recorded`: the interval of the recording [s] of which it is sampled, if "filtered"."""
-    (matrix, rows, start), finer = system, FINER if sampling == "filtered" else 1
+    """Autocovariance of the sampled output of parts along a leading axis, good for that many lags;
+    not finite where it does not decay. `recorded`: the interval of the recording [s] of which it is
+    sampled, if "filtered"."""
+    (matrix, rows, start), finer = Covariances.of(chain), FINER if sampling == "filtered" else 1
+    columns = jnp.swapaxes(start, 1, 2)
     if sampling == "average":
         # Means over the interval: r(0) = 2/Δ² c ∫(Δ-s) e^(Ms) ds v and r(lΔ) = c J Φ^(l-1) J v /
         # Δ², J = ∫ e^(Ms) ds.
-        n = len(matrix)
-        zero, eye = jnp.zeros_like(matrix), jnp.eye(n, dtype=matrix.dtype)
-        blocks = jnp.block([[matrix * interval, eye, zero], [zero, zero, eye], [zero, zero, zero]])
-        whole = exponential(blocks)
-        step, mean, ramp = whole[:n, :n], whole[:n, n : 2 * n], whole[:n, 2 * n :]
-        first, rows, following = 2 * jnp.sum(rows @ ramp * start)[None], rows @ mean, start @ mean.T
+        n = matrix.shape[-1]
+        zero, eye = jnp.zeros_like(matrix), jnp.zeros_like(matrix) + jnp.eye(n, dtype=matrix.dtype)
+        whole = exponential(
+            jnp.block([[matrix * interval, eye, zero], [zero, zero, eye], [zero, zero, zero]])
+        )
+        step, mean, ramp = (whole[:, :n, k * n : (k + 1) * n] for k in range(3))
+        first = 2 * jnp.sum(rows @ ramp * start, axis=(1, 2))[:, None]
+        rows, following = rows @ mean, mean @ columns
     else:
         step = exponential(matrix * (interval / finer))
-        first, following = jnp.sum(rows * start)[None], start @ step.T
+        first, following = jnp.sum(rows * start, axis=(1, 2))[:, None], step @ columns
     count = (lags - 1).bit_length() + finer.bit_length()
     _, powers = jax.lax.scan(lambda power, _: (product(power, power), power), step, length=count)
     if sampling == "filtered":
-        first, following = _decimated(
-            powers, rows, start, jnp.asarray(recorded, step.dtype) * finer / interval
-        )
+        steps = jnp.asarray(recorded, step.dtype) * finer / interval
+        first, following = _decimated(powers, rows, columns, steps)
         powers = powers[finer.bit_length() - 1 :]
     # The last power carries an unstable system beyond any bound: no stationary covariance, so none
     # is returned.
-    stable = jnp.max(jnp.abs(powers[-1])) < 1e3
+    stable = jnp.max(jnp.abs(powers[-1]), axis=(1, 2)) < 1e3
     return Autocovariance(
-        jnp.where(stable, first, jnp.nan), rows, powers, jnp.where(stable, following, jnp.nan)
+        jnp.where(stable[:, None], first, jnp.nan),
+        rows,
+        powers,
+        jnp.where(stable[:, None, None], following, jnp.nan),
     )
 
 
@@ -303,23 +360,9 @@ def autocovariances(
     recorded: Scalar = 0.0,
 ) -> tuple[Autocovariance, list[int]]:
     """Of every independent part of the noise, along a leading axis; which component of the noise
-    each belongs to.
-
-    All are filled up to one size, so that whatever follows is traced and compiled once, however
-    many there are.
-    """
-    parts = [(own, i) for i, each in enumerate(covariances(task, system)) for own in each]
-    size = max(len(own.matrix) for own, _ in parts)
-    count = max(len(own.rows) for own, _ in parts)
-
-    def filled(own: Covariances) -> Covariances:
-        more, less = size - len(own.matrix), count - len(own.rows)
-        # states that nothing drives or reads
-        decaying = -settings.rate * jnp.eye(more, dtype=own.matrix.dtype)
-        rows, start = (jnp.pad(x, ((0, less), (0, more))) for x in (own.rows, own.start))
-        return Covariances(jax.scipy.linalg.block_diag(own.matrix, decaying), rows, start)
-
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *(filled(own) for own, _ in parts))
-    made = functools.partial(_autocovariance, sampling=settings.sampling, recorded=recorded)
-    found = jax.vmap(lambda own: made(own, 1 / settings.rate, lags))(stacked)
+    each belongs to."""
+    parts = [(own, i) for i, each in enumerate(chains(task, system)) for own in each]
+    found = autocovariance(
+        stacked([own for own, _ in parts]), 1 / settings.rate, lags, settings.sampling, recorded
+    )
     return found, [i for _, i in parts]

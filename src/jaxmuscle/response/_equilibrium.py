@@ -9,8 +9,9 @@ from jaxmuscle._common.arrays import as_arrays, is_concrete
 from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
-from jaxmuscle.model._signals import AbstractSignal
+from jaxmuscle.model._signals import AbstractSignal, Harmonic
 from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 HOLD = 15.0
@@ -74,6 +75,19 @@ def _equilibrium(task: AbstractTask, time: Scalar | float) -> Float[Array, " sta
 
 
 def mechanics(task: AbstractTask) -> AbstractTask:
+    """The task as arrays, with the usual noise, harmonic and spectrum settings and without
+    activation, on which its operating point does not depend: one program serves all tasks that
+    differ in these."""
+    bare = task.with_parts(
+        noise=BandLimitedNoise(),
+        harmonic=Harmonic(),
+        activation=None,
+        settings=SpectrumSettings(),
+    )
+    return as_arrays(bare)
+
+
+def without_settings(task: AbstractTask) -> AbstractTask:
     """The task as arrays, with the usual spectrum settings: a program that needs none serves tasks
     of any settings."""
     return as_arrays(task.with_parts(settings=SpectrumSettings()))

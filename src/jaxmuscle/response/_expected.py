@@ -9,19 +9,17 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
-from jaxmuscle._common.arrays import all_concrete, as_arrays
+from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._bin_law import bin_rows, sides_of
 from jaxmuscle.spectra._settings import LONGEST, WINDOW, SpectrumSettings, samples_in, tapers_of
-from jaxmuscle.spectra._welch import Spectrum
 
 from ._autocovariance import autocovariances, covariances
-from ._equilibrium import mechanics
 from ._harmonic_line import LONG, harmonic_line, removed, transformed
-from ._linearised import Linearisation, LinearTask, linearisation, linearise
+from ._linearised import Linearisation, linearise
 
 TAIL = 1e-13
 ROUNDING = 1e-20  # of any unit of the output: fluctuations that are smaller are none
@@ -34,18 +32,14 @@ class Moments(NamedTuple):
     recording.
 
     The variance is that of the low-passed output, as a recording's: what lies above the low-pass is
-    not in it. `rate` is the slowest of the operating point [1/s], `half` the frequency of half
-    power of the slow part [Hz], where they were computed. `resonant`: Welch power per bin of every
-    resonance alone. `stiffness`: real and imaginary part of the dynamic stiffness at the points of
-    a measured one.
+    not in it. `resonant`: Welch power per bin of every resonance alone. `stiffness`: real and
+    imaginary part of the dynamic stiffness at the points of a measured one.
     """
 
     power: Float[Array | np.ndarray, " bins"]
     line: Float[Array | np.ndarray, " bins"]
     mean: Float[Array | np.ndarray, ""]
     variance: Float[Array | np.ndarray, ""]
-    rate: Float[Array | np.ndarray, ""] | float = np.nan
-    half: Float[Array | np.ndarray, ""] | float = np.nan
     resonant: tuple[Float[Array | np.ndarray, " bins"], ...] = ()
     stiffness: Float[Array | np.ndarray, "2 points"] | tuple[()] = ()
 
@@ -165,9 +159,9 @@ def noise_response(
     lags = lags_of(settings)
     each, of = autocovariances(task, system, settings, max(lags, LONGEST), recorded)
     belongs = np.equal.outer(np.arange(len(task.noise.components)), of).astype(system.A.dtype)
-    r = belongs @ jax.vmap(lambda own: own.lagged(lags))(each)
+    r = belongs @ each.lagged(lags)
     found = jnp.stack([expected_powers(settings, own) for own in r])
-    slow = jnp.sum(jax.vmap(lambda own: own.mean_variance(samples))(each))
+    slow = jnp.sum(each.mean_variance(samples))
     whole = jnp.sum(found, axis=0)
     return found[:, :-2], whole[-2] - slow + whole[-1] / jnp.asarray(samples, found.dtype) ** 2
 
@@ -203,30 +197,7 @@ def response(
         if isinstance(part, ResonantNoise)
     )
     power = jnp.sum(noise, axis=0) + line
-    # Without the slowest rate, which has no second derivative.
-    return Moments(power, line, system.rest, variance + swing, resonant=resonant), system
-
-
-_compiled_response = kept(response)
-
-
-def expected_moments(
-    task: AbstractTask,
-    settings: SpectrumSettings,
-    window: tuple[float, float],
-    samples: Int[Array | np.ndarray, ""] | int | None = None,
-    recorded: Scalar = 0.0,
-) -> tuple[Moments, Linearisation]:
-    """`response`, compiled once for all numbers of samples and intervals of recordings.
-
-    Outside a transformation by two programs: that of the linearisation serves all settings, and
-    what follows from it all tasks with as many states.
-    """
-    samples = as_arrays(samples_in(window, settings) if samples is None else samples, int)
-    if all_concrete((task, samples)):
-        bare = mechanics(task)
-        task = LinearTask.of(bare, linearisation(bare))
-    return _compiled_response(as_arrays(task), settings, window, samples, as_arrays(recorded))
+    return Moments(power, line, system.rest, variance + swing, resonant), system
 
 
 def log_variation_sd(
@@ -260,8 +231,8 @@ def _log_variation_sd(
     spread = jnp.asarray(low_pass_spread(settings), system.A.dtype)
     reach = len(spread) // 2
     each, _ = autocovariances(task, system, settings, most + reach)
-    r = jnp.sum(jax.vmap(lambda own: own.lagged(most + reach))(each), axis=0)
-    slow = jnp.sum(jax.vmap(lambda own: own.mean_variance(samples))(each))
+    r = jnp.sum(each.lagged(most + reach), axis=0)
+    slow = jnp.sum(each.mean_variance(samples))
     r = jnp.convolve(jnp.concatenate([r[reach:0:-1], r]), spread, mode="valid") - slow
     _, swing = harmonic_line(task, system, settings, WINDOW, samples)
     lag, n = jnp.arange(most, dtype=r.dtype), jnp.asarray(samples, r.dtype)
@@ -269,16 +240,6 @@ def _log_variation_sd(
     turning = jnp.cos(2 * np.pi * task.harmonic.frequency * lag / settings.rate)
     variance = jnp.sum(weight * (2 * r**2 + 4 * swing * r * turning))
     return 0.5 * jnp.sqrt(variance) / (r[0] + swing)
-
-
-def linear_spectrum(
-    task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float] = WINDOW
-) -> Spectrum:
-    """The expected Welch spectrum in linear response, of tasks that have one; not finite where they
-    have not."""
-    moments, _ = expected_moments(task, settings, window)
-    frequency = jnp.asarray(settings.frequency, moments.power.dtype)
-    return Spectrum(frequency, moments.power, settings, task.output_unit)
 
 
 def check_power(task: AbstractTask, moments: Moments) -> None:

@@ -10,7 +10,8 @@ from jaxmuscle.spectra._decimation import LEAST_RATES
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum
 
-from ._expected import Moments, check_line, check_power, expected_moments
+from ._expected import Moments, check_line, check_power
+from ._expected_moments import expected_moments
 from ._linearised import check_equilibrium, check_inputs
 from ._second_order import warn_beyond
 

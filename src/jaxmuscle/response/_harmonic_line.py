@@ -1,5 +1,6 @@
 """The harmonic's line in a Welch spectrum, and how a segment is transformed."""
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -51,14 +52,12 @@ def _ordinates(
     return found * jnp.asarray(np.sqrt(sides_of(settings))[:, None], found.dtype)
 
 
-def _low_pass(settings: SpectrumSettings, turn: Complex[Array, ""]) -> Complex[Array, ""]:
+def _low_pass(segments: "Segments", turn: Complex[Array, ""]) -> Complex[Array, ""]:
     """Frequency response of the digital low-pass at z = `turn`."""
-    if settings.sections is None:
-        return jnp.ones_like(turn)
     back = jnp.stack([jnp.ones_like(turn), 1 / turn, 1 / turn**2])
-    sections = jnp.asarray(settings.sections, turn.dtype)
+    sections = jnp.asarray(segments.sections, turn.dtype)
     gain = jnp.prod((sections[:, :3] @ back) / (sections[:, 3:] @ back))
-    return gain * jnp.conj(gain) if settings.filter_direction == "both" else gain
+    return jnp.where(jnp.asarray(segments.both) > 0, gain * jnp.conj(gain), gain)
 
 
 def _sampled(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
@@ -69,6 +68,50 @@ def _sampled(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
     taps = anti_alias(FINER) if sampling == "filtered" else np.ones(1)
     turns = turn_of(angle * jnp.asarray(np.arange(len(taps)) - len(taps) // 2, angle.dtype) / FINER)
     return jnp.asarray(taps, turns.dtype) @ turns
+
+
+class Segments(NamedTuple):
+    """How a signal becomes the segments of a Welch spectrum, as arrays: real and imaginary parts of
+    the `bin_rows` (none of long segments), the sampling interval [s], where segments begin
+    [samples] and how much each counts, sections of the low-pass, and whether it is passed both
+    ways."""
+
+    rows: Float[Array | np.ndarray, "bins parts samples"]
+    interval: Float[Array | np.ndarray, ""]
+    begins: Float[Array | np.ndarray, " segments"]
+    weight: Float[Array | np.ndarray, " segments"]
+    sections: Float[Array | np.ndarray, "sections 6"]
+    both: Float[Array | np.ndarray, ""]
+
+    def filled(self, bins: int, samples: int) -> "Segments":
+        """In a larger shape: with bins that are zero, and what counts nothing."""
+        more = -len(self.begins) % 64
+        none = np.tile([1.0, 0, 0, 1, 0, 0], (max(8 - len(self.sections), 0), 1))
+        zeros = ((0, bins - len(self.rows)), (0, 0), (0, samples - self.rows.shape[-1]))
+        return Segments(
+            np.pad(self.rows, zeros),
+            self.interval,
+            np.pad(self.begins, (0, more), mode="edge"),
+            np.pad(self.weight, (0, more)),
+            np.concatenate([self.sections, none]),
+            self.both,
+        )
+
+
+@functools.cache
+def segments_of(settings: SpectrumSettings, window: tuple[float, float]) -> Segments:
+    """Those of some settings in a window."""
+    start, stop = (round(edge * settings.rate) for edge in window)
+    count = settings.segments(stop - start)
+    rows = bin_rows(settings) if settings.length <= LONG else np.zeros((0, 0, 0))
+    return Segments(
+        np.concatenate([np.real(rows), np.imag(rows)], axis=1),
+        np.array(1 / settings.rate),
+        start + settings.step * np.arange(max(count, 1), dtype=float),
+        np.full(max(count, 1), 1 / count if count else np.nan),
+        np.zeros((0, 6)) if settings.sections is None else settings.sections,
+        np.array(float(settings.filter_direction == "both")),
+    )
 
 
 class LineTable(NamedTuple):
@@ -119,7 +162,7 @@ def line_levels(
 
 
 def _turns(
-    turns: Float[Array, ""], start: int, samples: Int[Array | np.ndarray, ""] | int
+    turns: Float[Array, ""], start: Float[Array, ""], samples: Int[Array | np.ndarray, ""] | int
 ) -> Complex[Array, ""]:
     """Mean of `exp(2πi turns m)` over so many successive m from `start` on."""
     n = jnp.asarray(samples, turns.dtype)
@@ -149,29 +192,50 @@ def _table(
     frequency: Float[Array, ""],
     samples: Int[Array, ""],
 ) -> LineTable:
-    angle = 2 * jnp.pi * frequency / settings.rate
-    turn, gain = turn_of(angle), _sampled(angle, settings.sampling)
-    start, stop = (round(edge * settings.rate) for edge in window)
-    begins = start + settings.step * np.arange(settings.segments(stop - start))
+    long = settings if settings.length > LONG else None
+    return table_of(segments_of(settings, window), frequency, samples, settings.sampling, long)
+
+
+def _wave(angle: Float[Array, ""], count: int) -> tuple[Array, Array]:
+    """cos and sin of `angle m`, m = 0 ... count - 1: of few angles, whose sums give the others."""
+    few = 1 << ((count - 1).bit_length() + 1) // 2
+    fine = angle * np.arange(few, dtype=angle.dtype)
+    coarse = (angle * few) * np.arange(-(-count // few), dtype=angle.dtype)[:, None]
+    c, s, cos, sin = jnp.cos(fine), jnp.sin(fine), jnp.cos(coarse), jnp.sin(coarse)
+    return tuple(x.reshape(-1)[:count] for x in (cos * c - sin * s, sin * c + cos * s))
+
+
+def table_of(
+    segments: Segments,
+    frequency: Float[Array, ""],
+    samples: Int[Array, ""],
+    sampling: str,
+    long: SpectrumSettings | None,
+) -> LineTable:
+    """`line_table` of segments; of `long` ones with their settings."""
+    interval = jnp.asarray(segments.interval, frequency.dtype)
+    angle = 2 * jnp.pi * frequency * interval
+    turn, gain = turn_of(angle), _sampled(angle, sampling)
     # With ahead, behind = rows @ e^(±i angle m) and z the same of the real and of the imaginary
     # rows, which takes no complex product: Σ |ahead|² + |behind|² = 2 Σ |z|² and Σ ahead
     # conj(behind) = Σ z².
-    spin = angle * np.arange(settings.length, dtype=angle.dtype)
-    if settings.length > LONG:
-        cos, sin = (_ordinates(settings, wave(spin)) for wave in (jnp.cos, jnp.sin))
-        parts = [(jnp.real(x), jnp.imag(x)) for x in (cos, sin)]
+    if long is not None:
+        wave = _wave(angle, long.length)
+        parts = [(jnp.real(x), jnp.imag(x)) for x in (_ordinates(long, own) for own in wave)]
         z = jax.lax.complex(*(jnp.concatenate(own, axis=1) for own in parts))
     else:
-        rows = bin_rows(settings)
-        rows = jnp.asarray(np.concatenate([np.real(rows), np.imag(rows)], axis=1), angle.dtype)
-        z = jax.lax.complex(rows @ jnp.cos(spin), rows @ jnp.sin(spin))
-    through = gain * _low_pass(settings, turn)
+        rows = jnp.asarray(segments.rows, angle.dtype)
+        cos, sin = _wave(angle, rows.shape[-1])
+        z = jax.lax.complex(rows @ cos, rows @ sin)
+    through = gain * _low_pass(segments, turn)
     level = 0.5 * jnp.abs(through) ** 2 * jnp.sum(jnp.abs(z) ** 2, axis=1)
     both = jnp.sum(z**2, axis=1)
-    turning = 0.5 * through**2 * jnp.mean(turn_of(2 * angle * begins.astype(angle.dtype))) * both
+    begins, weight = (jnp.asarray(x, angle.dtype) for x in (segments.begins, segments.weight))
+    around = turn_of(2 * angle * begins)
+    turning = 0.5 * through**2 * jnp.sum(weight.astype(around.dtype) * around) * both
     level = jnp.stack([level, -jnp.real(turning), jnp.imag(turning)])
     once, twice = (
-        through**k * _turns(k * frequency / settings.rate, start, samples) for k in (1, 2)
+        through**k * _turns(k * frequency * interval, begins[0], samples) for k in (1, 2)
     )
     return LineTable(level, jnp.abs(through) ** 2, once, twice)
 

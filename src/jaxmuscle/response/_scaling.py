@@ -17,7 +17,8 @@ from jaxmuscle.model._parameters import amplitude_names, names_of
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._expected import Moments, expected_moments
+from ._expected import Moments
+from ._expected_moments import expected_moments
 from ._linearised import check_equilibrium, check_inputs
 from ._second_order import warn_beyond
 

@@ -23,7 +23,8 @@ from jaxmuscle.model._white_noise import BandLimitedNoise, WhiteNoise
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
 from ._equilibrium import HOLD, mechanics
-from ._expected import Moments, covariance_operator, expected_moments, expected_powers, lags_of
+from ._expected import Moments, covariance_operator, expected_powers, lags_of
+from ._expected_moments import expected_moments
 from ._harmonic_line import LONG
 from ._linearised import Linearisation, linearisation
 

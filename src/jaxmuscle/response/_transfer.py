@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._activation import ACTIVE
 from jaxmuscle.model._muscle import Perturbation
 from jaxmuscle.model._tasks import AbstractTask
@@ -104,43 +105,50 @@ def polynomial(
 
 
 def half_power_level(
-    task: AbstractTask, system: Linearisation, log_f: Float[Array, "*any"]
+    system: Linearisation, stiffness: Scalar, time: Scalar, log_f: Float[Array, "*any"]
 ) -> Float[Array, "*any"]:
     """`ln(2 |H(f)|² / |H(0)|²)`, H the response to noise on K_w: zero where half its power is left.
 
-    Smooth in the parameters everywhere, which the frequency of its first zero is not
-    (docs/fitting.md).
+    `stiffness` is K_w0, `time` the contraction time T of an activation, which takes off `2 ln(1 +
+    (2πf T)²)` (0: none). Smooth in the parameters everywhere, which the frequency of its first zero
+    is not (docs/fitting.md).
     """
-    return _level(log_f, *_active_response(task, system))
+    return _level(log_f, *_active_response(system, stiffness), time)
 
 
-def _active_response(task: AbstractTask, system: Linearisation) -> tuple[Array, Array]:
+def _active_response(system: Linearisation, stiffness: Scalar) -> tuple[Array, Array]:
+    base = jnp.zeros(5, system.A.dtype).at[0].set(stiffness)
     return polynomials(
-        system_of(task, system, jnp.zeros(5, system.A.dtype).at[0].set(task.muscle.base()[0]))
+        SignalSystem(system.A, system.B @ base, system.C, system.D @ base, system.E @ base)
     )
 
 
-def _level(log_f: Float[Array, "*any"], above: Array, below: Array) -> Float[Array, "*any"]:
-    s = times_i(2 * jnp.pi * jnp.exp(log_f))
+def _level(
+    log_f: Float[Array, "*any"], above: Array, below: Array, time: Scalar
+) -> Float[Array, "*any"]:
+    omega = 2 * jnp.pi * jnp.exp(log_f)
+    s = times_i(omega)
     gain = jnp.abs(polynomial(above, s) / polynomial(below, s)) * jnp.abs(below[-1] / above[-1])
-    return 2 * jnp.log(gain) + np.log(2.0)
+    return 2 * (jnp.log(gain) - jnp.log1p((omega * time) ** 2)) + np.log(2.0)
 
 
-def half_power_frequency(task: AbstractTask, system: Linearisation) -> Float[Array, ""]:
+def half_power_frequency(
+    system: Linearisation, stiffness: Scalar, time: Scalar
+) -> Float[Array, ""]:
     """Frequency [Hz] at which white noise on K_w has fallen to half its power at 0: relaxation and
-    activation together.
+    activation together; arguments of `half_power_level`.
 
     The lowest one between 1 mHz and 100 Hz; not a number where there is none. Between two points of
     a grid, then by one Newton step, the only one that is differentiated (the implicit function
     theorem), with the slope of the grid.
     """
-    above, below = _active_response(task, system)
+    above, below = _active_response(system, stiffness)
     grid = jnp.linspace(np.log(1e-3), np.log(100.0), POINTS)
-    levels = jax.lax.stop_gradient(_level(grid, above, below))
+    levels = jax.lax.stop_gradient(_level(grid, above, below, time))
     i = jnp.argmax(levels < 0)
     step = grid[1] - grid[0]
     x = grid[i] - levels[i] / (levels[i] - levels[i - 1]) * step
     before, here, after = (levels[i + k] - levels[i + k - 1] for k in (-1, 0, 1))
     slope = (here + (after - before) / 2 * ((x - grid[i]) / step + 0.5)) / step
-    found = jnp.exp(x - _level(x, above, below) / slope)
+    found = jnp.exp(x - _level(x, above, below, time) / slope)
     return jnp.where((i > 0) & (levels[i] < 0), found, jnp.nan)

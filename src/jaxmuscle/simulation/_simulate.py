@@ -17,7 +17,7 @@ from jaxmuscle._common.text import listed
 from jaxmuscle._common.types import Key, Seed
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._task import AbstractTask, require_task
-from jaxmuscle.response._equilibrium import fastest_rate, mechanics
+from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_inputs, linearised
 from jaxmuscle.spectra._settings import WINDOW, Sampling, SpectrumSettings
 
@@ -246,7 +246,12 @@ def trajectories(
     computed."""
     recipe = Recipe(plan.grid, plan.sampling, True, SpectrumSettings(), draws=draws)
     found = run_seeds(
-        mechanics(task), None if linear is None else mechanics(linear), key, seeds, recipe, mesh
+        without_settings(task),
+        None if linear is None else without_settings(linear),
+        key,
+        seeds,
+        recipe,
+        mesh,
     )
     grid = plan.grid
     return Trajectory(

@@ -18,7 +18,7 @@ from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._stream import VERSION as STREAM
 from jaxmuscle.model._task import is_batched
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.response._expected import linear_spectrum
+from jaxmuscle.response._expected_moments import linear_spectrum
 from jaxmuscle.spectra._decimation import at_every
 from jaxmuscle.spectra._mean import SpectrumEstimate, estimated
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings

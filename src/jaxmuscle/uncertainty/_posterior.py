@@ -2,10 +2,8 @@
 believed."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -19,12 +17,9 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import bounds_of, reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._arguments import settings_of
-from jaxmuscle.objective._consequences import Tables, frequency_of
-from jaxmuscle.objective._coordinates import task_at
-from jaxmuscle.objective._derived import derived
+from jaxmuscle.objective._consequences import expand, quantities
 from jaxmuscle.objective._likelihood import Likelihood
 from jaxmuscle.objective._problem import FitProblem
-from jaxmuscle.objective._residuals import PartResiduals, Residuals
 
 from ._chains import Chains, sample
 from ._frequency_grid import edges_of
@@ -131,7 +126,9 @@ def _reported(
     theta, s = _thetas(problem, density, found)
     found = found._replace(s=s)
     flat = theta.reshape(-1, theta.shape[-1])
-    derived, moments = _consequences(density.likelihood.objective, flat)
+    objective = density.likelihood.objective
+    seen = expand(objective, flat, slopes=False)
+    derived, moments = quantities(objective, seen)[0], seen.moments
     values = problem.coordinates.values_of(flat)
     samples = {name: values[:, i].reshape(shape) for i, name in enumerate(names)}
     places = {name: problem.where(name) for name in result.derived_names if name not in samples}
@@ -229,25 +226,3 @@ def _filled(rows: np.ndarray) -> list[np.ndarray]:
     fill = np.broadcast_to(rows[-1], (-len(rows) % ROWS, *rows.shape[1:]))
     whole = np.concatenate([rows, fill])
     return np.split(whole, len(whole) // ROWS)
-
-
-def _consequences(objective: Residuals, theta: np.ndarray) -> tuple[Tables, Any]:
-    """Derived quantities and moments of every part at every θ."""
-    parts = list(enumerate(objective.parts))
-    rows = [
-        tuple(_values(part, objective.own(some, i)) for i, part in parts) for some in _filled(theta)
-    ]
-    found = jax.tree.map(lambda *x: np.concatenate(x)[: len(theta)], *rows)
-    return tuple(values for values, _ in found), tuple(moments for _, moments in found)
-
-
-@kept
-def _values(part: PartResiduals, theta: Array | np.ndarray) -> tuple[dict[str, Array], Any]:
-    def one(theta):
-        moments = part.moments(theta)
-        return (
-            derived(task_at(part.task, part.coordinates, theta), moments, frequency_of(part)),
-            moments,
-        )
-
-    return jax.lax.map(one, jnp.asarray(theta), batch_size=16)

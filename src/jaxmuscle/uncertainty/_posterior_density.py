@@ -67,19 +67,16 @@ class Features(NamedTuple):
         )
         line = jnp.pad(line, ((0, 0), (0, 1)))
         power = (self.power / scale).astype(line.dtype)
-        unknown = jnp.full((), jnp.nan)
         return Moments(
             power[:, None] + line,
             line,
             self.mean,
             self.variance + table.variance(reply),
-            unknown,
-            unknown,
             stiffness=self.stiffness,
         )
 
 
-GRID = Moments(1, 1, None, 0, None, None, None, None)  # pyright: ignore  # which axis counts the frequencies
+GRID = Moments(1, 1, None, 0, None, None)  # pyright: ignore  # which axis counts the frequencies
 
 
 class Level(eqx.Module):

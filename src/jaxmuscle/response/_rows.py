@@ -1,0 +1,637 @@
+"""The linear response of many tasks at once, with slopes, by programs that tasks of every make
+share (docs/model.md, *By few programs*).
+
+A program of the mechanics, one of what the noise is made of, one for a part of the noise and a
+direction, two for the line.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.programs import kept
+from jaxmuscle._common.types import Scalar
+from jaxmuscle.model._activation import ACTIVE
+from jaxmuscle.model._parameters import USUALLY_FREE, paths_of, set_parameters
+from jaxmuscle.model._resonant_noise import ResonantNoise
+from jaxmuscle.model._signals import Constant
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.spectra._settings import LONGEST, SpectrumSettings
+
+from ._autocovariance import DECAY, Chain, autocovariance, chains, stacked
+from ._equilibrium import HOLD, mechanics
+from ._expected import Moments, covariance_operator, expected_powers, lags_of
+from ._harmonic_line import (
+    LONG,
+    LineTable,
+    Segments,
+    harmonic_line,
+    harmonic_size,
+    segments_of,
+    table_of,
+)
+from ._input_response import parts_of_stiffness
+from ._linearised import Linearisation, LinearTask, linearise
+from ._transfer import SignalSystem, harmonic_system, transfer
+
+POINTS, MANY = 32, 512
+LATEST = 8
+BLOCK, FEW, ROWS = 32, 8, 512
+# free with a known mean force, with a moved insertion and in designs
+SOMETIMES = ("P_w", "m_w", "m_z")
+FURTHER = 4  # states of a filter and of an activation behind those of a task
+CHANNELS = 5
+LEAST_LAGS, LEAST_BINS = 512, 32
+NOT_MECHANICAL = ("noise", "harmonic", "activation")
+
+
+def program_names(task: AbstractTask, own: Sequence[str] = ()) -> tuple[str, ...]:
+    """The names that a program has slopes for: of the usually free ones those that the task has, in
+    one order whatever is asked for, then other ones of one's `own`."""
+    known = task.parameter_names
+    usual = (name for name in (*USUALLY_FREE, *SOMETIMES) if name in known)
+    return tuple(dict.fromkeys([*usual, *own]))
+
+
+class Sampled(NamedTuple):
+    """How moments are sampled: settings and window of the spectrum, number of samples of the
+    recording whose variance it is, and the interval [s] at which it was recorded, as in
+    `response`."""
+
+    settings: SpectrumSettings
+    window: tuple[float, float]
+    samples: Int[Array | np.ndarray, ""] | int
+    recorded: Scalar
+
+
+def moments_of_rows(
+    task: AbstractTask,
+    own: Sequence[str],
+    values: Float[np.ndarray, "rows own"],
+    sampled: Sampled,
+    points: Float[np.ndarray, " points"] | None = None,
+    along: Sequence[str] | None = None,
+) -> tuple[Moments, Moments, Linearisation]:
+    """Moments of the task with each row of natural values for its `own` names, their slopes `along`
+    these (or some of them) in a last axis, and the linearisations. As `response`, whose numbers
+    these are.
+
+    A moment is a sum over the parts p of the noise, M = Σ_p m(x_p), and its slope with respect to a
+    value v is `Σ_p m'(x_p) dx_p/dv`: a row of the large program is a part and one direction. So it
+    costs what is asked for, however many parts there are.
+    """
+    sampled = sampled._replace(
+        samples=as_arrays(sampled.samples, int), recorded=as_arrays(sampled.recorded)
+    )
+    many = _Many(task, tuple(own), tuple(own if along is None else along), sampled)
+    found = [many.moments(values[i : i + MANY], points) for i in range(0, len(values), MANY)]
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+
+
+class _Made(NamedTuple):
+    """What the moments of a task are computed from: its noise, part by part, and its line."""
+
+    parts: Chain
+    line: "_Line | None"
+
+
+class _Line(NamedTuple):
+    """A steady harmonic: what responds to it, its size (real and imaginary part), its frequency."""
+
+    system: SignalSystem
+    size: Float[Array | np.ndarray, "2"]
+    frequency: Float[Array | np.ndarray, ""]
+
+
+class Near(NamedTuple):
+    """A linearisation and its slopes with respect to the mechanical values."""
+
+    system: Linearisation
+    slopes: Linearisation
+    values: Float[Array | np.ndarray, " moving"]
+
+    def at(self, values: Float[Array | np.ndarray, " moving"]) -> Linearisation:
+        """To first order, which gives its value and its slope there exactly."""
+        away = values - self.values
+        return jax.tree.map(lambda x, slope: x + slope @ away, self.system, self.slopes)
+
+
+def value_and_slopes(function: Callable[[Any], Any], at: Any) -> tuple[Any, Any]:
+    """A function's value and its Jacobian."""
+
+    def twice(at):
+        value = function(at)
+        return value, value
+
+    slopes, value = jax.jacfwd(twice, has_aux=True)(at)
+    return value, slopes
+
+
+@kept
+def _linearisations_of(
+    task: AbstractTask,
+    names: tuple[str, ...],
+    values: Float[Array | np.ndarray, "points names"],
+    time: Scalar | np.ndarray,
+) -> tuple[Linearisation, Linearisation]:
+    """Of a bare task with each row of its mechanical values, and the slopes."""
+
+    def one(values):
+        return linearise(set_parameters(task, dict(zip(names, values, strict=True))), time)
+
+    return jax.vmap(lambda values: value_and_slopes(one, values))(values)
+
+
+def _with_values(task: LinearTask, names: tuple[str, ...], values: Array) -> AbstractTask:
+    own = task.parameter_names
+    return set_parameters(task, {n: v for n, v in zip(names, values, strict=True) if n in own})
+
+
+@kept
+def _made(
+    task: LinearTask,
+    names: tuple[str, ...],
+    place: Int[Array | np.ndarray, " moving"],
+    values: Float[Array | np.ndarray, "points names"],
+    near: Near,
+) -> tuple[_Made, _Made]:
+    """What the large programs take, of a task with each row of values, and its slopes. `place`:
+    where the mechanical values are."""
+    size = len(task.system.A) + FURTHER
+
+    def one(values, near):
+        def made(values):
+            there, system = _with_values(task, names, values), near.at(values[place])
+            parts = [part for own in chains(there, system) for part in own]
+            line = None
+            if isinstance(task.harmonic.envelope, Constant):
+                reply = harmonic_size(there, system.A.dtype)
+                line = _Line(
+                    _filled(harmonic_system(there, system), len(task.system.A) + 2),
+                    jnp.stack([jnp.real(reply), jnp.imag(reply)]),
+                    jnp.asarray(there.harmonic.frequency, system.A.dtype),
+                )
+            return _Made(stacked(parts, size, CHANNELS), line)
+
+        return value_and_slopes(made, values)
+
+    return jax.vmap(one)(values, near)
+
+
+def _filled(system: SignalSystem, size: int) -> SignalSystem:
+    """With states that nothing drives or reads."""
+    more = size - len(system.A)
+    idle = -DECAY * jnp.eye(more, dtype=system.A.dtype)
+    A = jax.scipy.linalg.block_diag(system.A, idle)
+    return SignalSystem(A, jnp.pad(system.b, (0, more)), jnp.pad(system.c, (0, more)), *system[3:])
+
+
+@kept
+def _enveloped(
+    task: LinearTask,
+    names: tuple[str, ...],
+    place: Int[Array | np.ndarray, " moving"],
+    sampled: tuple[SpectrumSettings, tuple[float, float]],
+    values: Float[Array | np.ndarray, "points names"],
+    near: Near,
+) -> tuple[Any, Any]:
+    """`harmonic_line` under an envelope that moves."""
+
+    def one(values, near):
+        def line(values):
+            there = _with_values(task, names, values)
+            return harmonic_line(there, near.at(values[place]), *sampled, 1)
+
+        return value_and_slopes(line, values)
+
+    return jax.lax.map(lambda row: one(*row), (values, near))
+
+
+@kept
+def _stiffness(
+    task: AbstractTask, names: tuple[str, ...], near: Near, f: Float[Array | np.ndarray, " points"]
+) -> tuple[Array, Array]:
+    """Dynamic stiffness of a bare task with each row of its mechanical values, and its slopes."""
+
+    def one(near):
+        def parts(values):
+            there = set_parameters(task, dict(zip(names, values, strict=True)))
+            return parts_of_stiffness(there, near.at(values), f)
+
+        return value_and_slopes(parts, near.values)
+
+    return jax.vmap(one)(near)
+
+
+def _in_blocks(
+    function: Callable[[Any], Any], rows: Any, towards: Any, count: Array, block: int = BLOCK
+) -> Any:
+    """A function of rows along a leading axis, and its slope in one direction for each: of the
+    first `count`, a `block` at a time; zeros for the others, which so take no time."""
+
+    def at(i):
+        cut = functools.partial(
+            jax.lax.dynamic_slice_in_dim, start_index=i * block, slice_size=block
+        )
+        return jax.jvp(function, (jax.tree.map(cut, rows),), (jax.tree.map(cut, towards),))
+
+    def put(i, found):
+        return jax.tree.map(
+            lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, i * block, 0),
+            found,
+            at(i),
+        )
+
+    size = len(jax.tree.leaves(rows)[0])
+    nothing = jax.tree.map(
+        lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), jax.eval_shape(at, 0)
+    )
+    return jax.lax.fori_loop(0, (count + block - 1) // block, put, nothing)
+
+
+@kept
+def _noise_rows(
+    parts: Chain,
+    towards: Chain,
+    count: Any,
+    operator: Float[Array | np.ndarray, "bins_and_two lags"] | SpectrumSettings,
+    interval: Float[Array | np.ndarray, ""],
+    sampling: str,
+    samples: Any,
+    recorded: Any,
+) -> tuple[Any, Any]:
+    """Welch power of parts of the noise in every bin, the variance of so many low-passed samples,
+    and their slopes in one direction for each."""
+    lags = lags_of(operator) if isinstance(operator, SpectrumSettings) else operator.shape[1]
+
+    def spectrum(parts):
+        each = autocovariance(parts, interval, max(lags, LONGEST), sampling, recorded)
+        r = each.lagged(lags)
+        if isinstance(operator, SpectrumSettings):
+            found = jax.lax.map(functools.partial(expected_powers, operator), r)
+        else:
+            found = r @ operator.T
+        own, lowered = found[:, -2], found[:, -1] / jnp.asarray(samples, r.dtype) ** 2
+        return found[:, :-2], own - each.mean_variance(samples) + lowered
+
+    return _in_blocks(spectrum, parts, towards, count)
+
+
+@kept
+def _line_tables(
+    frequency: Float[Array | np.ndarray, " rows"],
+    count: Any,
+    segments: Segments | tuple[SpectrumSettings, tuple[float, float]],
+    sampling: str,
+    samples: Any,
+) -> tuple[LineTable, LineTable]:
+    """Of every frequency, and their slopes with respect to it."""
+    made = segments if isinstance(segments, Segments) else segments_of(*segments)
+    settings = None if isinstance(segments, Segments) else segments[0]
+
+    def tables(frequency):
+        return jax.vmap(lambda f: table_of(made, f, samples, sampling, settings))(frequency)
+
+    return _in_blocks(tables, frequency, jnp.ones_like(frequency), count, FEW)
+
+
+@kept
+def _line_rows(
+    given: tuple[_Line, LineTable],
+    towards: tuple[_Line, LineTable],
+    count: Any,
+) -> tuple[Any, Any]:
+    """Power in every bin and variance of lines, and their slopes in one direction for each."""
+
+    def one(line, table):
+        reply = jax.lax.complex(*line.size) * transfer(line.system, 2 * jnp.pi * line.frequency)
+        return table.power(reply), table.variance(reply)
+
+    return _in_blocks(lambda given: jax.vmap(one)(*given), given, towards, count)
+
+
+class Mechanics:
+    """One task to be linearised with many values of its `own` parameters.
+
+    `bare`: what its mechanics depend on, with the names of the `moving` values; `bearer`: what its
+    noise and its line depend on besides the linearisation; `names`: all that programs have slopes
+    for, of which the moving ones are at `place`.
+    """
+
+    def __init__(self, task: AbstractTask, own: tuple[str, ...]):
+        self.task, self.own, self.names = task, own, program_names(task, own)
+        self.defaults = np.array([float(task[name]) for name in self.names])
+        self.columns = np.array([self.names.index(name) for name in own], dtype=int)
+        self.bare, paths = mechanics(task), paths_of(task)
+        place = [i for i, n in enumerate(self.names) if paths[n][0] not in NOT_MECHANICAL]
+        self.place, self.moving = np.array(place, dtype=int), tuple(self.names[i] for i in place)
+        self.seen: tuple[np.ndarray, Near] | None = None
+
+    @classmethod
+    def of(cls, task: AbstractTask, own: Sequence[str]) -> "Mechanics":
+        """Of the latest tasks made only once: to prepare one takes longer than to linearise it."""
+        for known in _LATEST:
+            if known.task is task and known.own == tuple(own):
+                return known
+        found = cls(task, tuple(own))
+        _LATEST[:] = [found, *_LATEST[: LATEST - 1]]
+        return found
+
+    @functools.cached_property
+    def bearer(self) -> LinearTask:
+        """With any linearisation of that many states."""
+        assert self.seen is not None
+        nothing = jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), self.seen[1].system)
+        usual = self.bare.settings
+        return as_arrays(LinearTask(nothing, **self.task.with_parts(settings=usual).common))
+
+    def at(self, values: Float[np.ndarray, "rows own"]) -> tuple[np.ndarray, Near]:
+        """Values of all names, and the linearisations there."""
+        whole = np.tile(self.defaults, (len(values), 1))
+        whole[:, self.columns] = values
+        whole = as_arrays(whole)
+        if self.seen is None or not np.array_equal(whole, self.seen[0]):
+            time, moving = as_arrays(HOLD), whole[:, self.place]
+            found = in_parts(
+                lambda some: _linearisations_of(self.bare, self.moving, some, time), moving
+            )
+            self.seen = whole, Near(*found, moving)
+        return self.seen
+
+
+_LATEST: list[Mechanics] = []
+
+
+def in_parts(program: Callable[..., Any], *rows: Any) -> Any:
+    """What a program for `POINTS` rows makes of any number of them, as numbers."""
+    count = len(jax.tree.leaves(rows)[0])
+    found = []
+    for i in range(0, count, POINTS):
+        here = np.minimum(np.arange(i, i + POINTS), count - 1)
+        made = program(*jax.tree.map(lambda x, here=here: np.asarray(x)[here], rows))
+        found.append(jax.tree.map(lambda x, n=count - i: np.asarray(x)[:n], made))
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+
+
+def mechanical_rows(
+    program: Callable[..., Any],
+    task: AbstractTask,
+    own: Sequence[str],
+    values: Float[np.ndarray, "rows own"],
+    *given: np.ndarray,
+) -> tuple[Any, Any]:
+    """What a program makes of (the bare task, the names of its mechanical values, the
+    linearisations of `POINTS` rows, contraction times there, whatever is given for each row), and
+    its slopes with respect to one's own values along a last axis.
+
+    The program's slopes are with respect to the mechanical values, then the contraction time (0
+    without an activation).
+    """
+    here = Mechanics.of(task, own)
+    _, near = here.at(values)
+    time = np.full(len(values), 0.0 if task.activation is None else float(task.activation.time))
+    if "activation_time" in own:
+        time = values[:, list(own).index("activation_time")]
+    value, slopes = in_parts(
+        functools.partial(program, here.bare, here.moving), near, *as_arrays((time, *given))
+    )
+    return value, _widened(slopes, (*here.moving, "activation_time"), own)
+
+
+def _widened(slopes: Any, names: Sequence[str], own: Sequence[str]) -> Any:
+    """Slopes with respect to some values as slopes with respect to one's own."""
+    place = np.array([names.index(n) if n in names else len(names) for n in own], dtype=int)
+    return jax.tree.map(
+        lambda x: np.concatenate([x, np.zeros((*x.shape[:-1], 1), x.dtype)], -1)[..., place],
+        slopes,
+    )
+
+
+class _Rows(NamedTuple):
+    """Rows of a large program, for points and parts: each has a part of one point, and the column
+    of the direction in which its slope is."""
+
+    part: np.ndarray
+    column: np.ndarray
+
+    @classmethod
+    def of(cls, slopes: Any, parts: int) -> "_Rows":
+        """A row for every part and each column that it depends on anywhere; the first column for
+        one that depends on none."""
+        leaves = [np.asarray(x) for x in jax.tree.leaves(slopes)]
+        moves = np.zeros((parts, leaves[0].shape[-1]), dtype=bool)
+        for x in leaves:
+            axes = (0, *range(2, x.ndim - 1))
+            moves |= np.any(x != 0, axis=axes)
+        if moves.shape[1]:
+            moves[~np.any(moves, axis=1), 0] = True
+            return cls(*np.nonzero(moves))
+        return cls(np.arange(parts), np.full(parts, -1))
+
+    def run(self, program: Callable[..., Any], given: Any, slopes: Any) -> tuple[Any, Any]:
+        """The program's results for every point and part, summed over nothing, and their slopes
+        along a last axis."""
+        points = len(jax.tree.leaves(given)[0])
+        rows = jax.tree.map(lambda x: _flat(np.asarray(x)[:, self.part]), given)
+        towards = jax.tree.map(lambda x: _flat(self._directions(np.asarray(x))), slopes)
+        whole = points * len(self.part)
+        found = []
+        for i in range(0, whole, ROWS):
+            count = min(ROWS, whole - i)
+            cut = functools.partial(_cut, begin=i, count=count)
+            made = program(jax.tree.map(cut, rows), jax.tree.map(cut, towards), np.asarray(count))
+            found.append(jax.tree.map(lambda x, count=count: np.asarray(x)[:count], made))
+        values, along = jax.tree.map(
+            lambda *x: np.concatenate(x).reshape(points, len(self.part), *x[0].shape[1:]), *found
+        )
+        return values, along
+
+    def _directions(self, slopes: np.ndarray) -> np.ndarray:
+        if not slopes.shape[-1]:
+            return np.zeros((*slopes.shape[:1], len(self.part), *slopes.shape[2:-1]), slopes.dtype)
+        return np.moveaxis(slopes[:, self.part, ..., self.column], 0, 1)
+
+    def first(self) -> np.ndarray:
+        """Of every part a row, in order."""
+        return np.unique(self.part, return_index=True)[1]
+
+    def spread(self, along: np.ndarray, parts: int, columns: int) -> np.ndarray:
+        """What is along the rows' directions as slopes of every part along a last axis."""
+        found = np.zeros((len(along), parts, *along.shape[2:], columns), along.dtype)
+        if columns:
+            found[:, self.part, ..., self.column] = np.moveaxis(along, 1, 0)
+        return found
+
+
+def _flat(x: np.ndarray) -> np.ndarray:
+    return x.reshape(-1, *x.shape[2:])
+
+
+def _cut(x: np.ndarray, begin: int, count: int) -> np.ndarray:
+    """So many rows in the shape of all that a program takes."""
+    whole = np.zeros((ROWS, *x.shape[1:]), x.dtype)
+    whole[:count] = x[begin : begin + count]
+    return whole
+
+
+class _Many(NamedTuple):
+    """One task, to be seen with many values of its `own` parameters, and slopes along some."""
+
+    task: AbstractTask
+    own: tuple[str, ...]
+    along: tuple[str, ...]
+    sampled: Sampled
+
+    def moments(
+        self, values: np.ndarray, points: np.ndarray | None
+    ) -> tuple[Moments, Moments, Linearisation]:
+        """Of some rows."""
+        here = Mechanics.of(self.task, self.own)
+        columns = np.array([here.names.index(name) for name in self.along], dtype=int)
+        whole, near = here.at(values)
+        program = functools.partial(_made, here.bearer, here.names, here.place)
+        made, by = in_parts(program, whole, near)
+        by = jax.tree.map(lambda x: x[..., columns], by)
+
+        def widened(slope: Any) -> np.ndarray:
+            return _widened(slope, here.moving, self.along)
+
+        power, variance, by_power, by_variance, resonant, by_resonant = self._noise(made, by)
+        line, swing, by_line, by_swing = (
+            self._line(made.line, by.line)
+            if made.line is not None
+            else self._enveloped(here, columns, whole, near)
+        )
+        stiffness = by_stiffness = ()
+        if points is not None:
+            f = as_arrays(np.resize(points, -(-len(points) // 64) * 64))
+            stiffness, slope = in_parts(
+                lambda near: _stiffness(here.bare, here.moving, near, f), near
+            )
+            stiffness = stiffness[:, :, : len(points)]
+            by_stiffness = widened(slope)[:, :, : len(points)]
+        system = near.system
+        return (
+            Moments(power + line, line, system.rest, variance + swing, resonant, stiffness),
+            Moments(
+                by_power + by_line,
+                by_line,
+                widened(near.slopes.rest),
+                by_variance + by_swing,
+                by_resonant,
+                by_stiffness,
+            ),
+            system,
+        )
+
+    def _noise(self, made: _Made, by: _Made) -> tuple[Any, ...]:
+        settings, parts = self.sampled.settings, made.parts.matrix.shape[1]
+        long = settings.length > LONG
+        rows = _Rows.of(by.parts, parts)
+        program = functools.partial(
+            _noise_rows,
+            operator=settings if long else as_arrays(_padded_operator(settings)),
+            interval=as_arrays(1 / settings.rate),
+            sampling=settings.sampling,
+            samples=self.sampled.samples,
+            recorded=self.sampled.recorded,
+        )
+        (power, variance), (along, rise) = rows.run(program, made.parts, by.parts)
+        bins, columns, first = len(settings.frequency), len(self.along), rows.first()
+        power, variance = power[:, first, :bins], variance[:, first]
+        by_power = rows.spread(along[..., :bins], parts, columns)
+        by_variance = rows.spread(rise, parts, columns)
+        component, components = _component_of_parts(self.task), self.task.noise.components
+        assert len(component) == parts
+        resonant, by_resonant = (
+            tuple(
+                np.sum(x[:, component == i], axis=1)
+                for i, each in enumerate(components)
+                if isinstance(each, ResonantNoise)
+            )
+            for x in (power, by_power)
+        )
+        sums = (np.sum(x, axis=1) for x in (power, variance, by_power, by_variance))
+        return (*sums, resonant, by_resonant)
+
+    def _line(self, line: Any, by: Any) -> tuple[np.ndarray, ...]:
+        settings, frequency = self.sampled.settings, line.frequency
+        different, back = np.unique(frequency, return_inverse=True)
+        segments = (
+            (settings, self.sampled.window)
+            if settings.length > LONG
+            else as_arrays(_padded_segments(settings, self.sampled.window))
+        )
+        tables = [
+            jax.tree.map(
+                lambda x, n=count: np.asarray(x)[:n],
+                _line_tables(
+                    _cut(different, i, count),
+                    np.asarray(count),
+                    segments,
+                    settings.sampling,
+                    self.sampled.samples,
+                ),
+            )
+            for i in range(0, len(different), ROWS)
+            for count in [min(ROWS, len(different) - i)]
+        ]
+        table, slope = jax.tree.map(lambda *x: np.concatenate(x)[back], *tables)
+        by_table = jax.tree.map(
+            lambda x: x[..., None] * by.frequency.reshape(len(x), *[1] * (x.ndim - 1), -1), slope
+        )
+        given, slopes = jax.tree.map(lambda x: x[:, None], ((line, table), (by, by_table)))
+        rows = _Rows.of(slopes, 1)
+        (power, swing), (along, rise) = rows.run(_line_rows, given, slopes)
+        bins, columns = len(settings.frequency), len(self.along)
+        by_power = rows.spread(along[..., :bins], 1, columns)[:, 0]
+        return power[:, 0, :bins], swing[:, 0], by_power, rows.spread(rise, 1, columns)[:, 0]
+
+    def _enveloped(
+        self, here: Mechanics, columns: np.ndarray, whole: np.ndarray, near: Near
+    ) -> tuple[np.ndarray, ...]:
+        sampled = self.sampled.settings, self.sampled.window
+        program = functools.partial(_enveloped, here.bearer, here.names, here.place, sampled)
+        (line, swing), (by_line, by_swing) = in_parts(program, whole, near)
+        return line, swing, by_line[..., columns], by_swing[..., columns]
+
+
+def _component_of_parts(task: AbstractTask) -> np.ndarray:
+    """Which component of the noise each of the parts of `chains` belongs to."""
+    found = []
+    for i, noise in enumerate(task.noise.components):
+        active = {task.activation is not None and j in ACTIVE for j in noise.acts_on}
+        found += [i] * (1 if noise.shared else len(active))
+    return np.array(found)
+
+
+@functools.cache
+def _padded_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins_and_two lags"]:
+    """`covariance_operator` in a shape that settings share: with bins of zeros, and lags that do
+    not count."""
+    operator = covariance_operator(settings)
+    bins, lags = operator.shape[0] - 2, operator.shape[1]
+    found = np.zeros((_size(bins, LEAST_BINS) + 2, _size(lags, LEAST_LAGS)))
+    found[:bins, :lags], found[-2:, :lags] = operator[:-2], operator[-2:]
+    return found
+
+
+@functools.cache
+def _padded_segments(settings: SpectrumSettings, window: tuple[float, float]) -> Segments:
+    """`segments_of` in a shape that settings share."""
+    return segments_of(settings, window).filled(
+        _size(len(settings.frequency), LEAST_BINS), _size(settings.length, LEAST_LAGS // 2)
+    )
+
+
+def _size(count: int, least: int) -> int:
+    """The next of `least`, 1.5 and 2 times as much, 3, 4 ..."""
+    while count > least:
+        least = least * 3 // 2 if least & (least - 1) == 0 else least * 4 // 3
+    return least
