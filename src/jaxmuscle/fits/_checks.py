@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle.data._target import Target
+from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import BATCH, Expansion, consequences, expand, quantities
 from jaxmuscle.objective._coordinates import Coordinates
@@ -75,7 +76,9 @@ class Stage(NamedTuple):
     minima: Minima
 
 
-def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Moments | None]:
+def controlled_moments(
+    runs: Trajectory, target: Target, task: AbstractTask
+) -> tuple[Moments, Moments | None]:
     """Moments of every seed, whose mean has the expectation of the nonlinear model, and those of
     the linear response.
 
@@ -88,7 +91,7 @@ def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Momen
     expected = None
     if runs.linear is not None:
         sampled = trial_samples(target), recorded_interval(target, settings)
-        exact, _ = expected_moments(runs.task, settings, WINDOW, *sampled)
+        exact, _ = expected_moments(task, settings, WINDOW, *sampled)
         expected = jax.tree.map(np.asarray, exact)
         beside = runs.beside()
         power = expected.power + power - np.asarray(beside.spectrum(settings).power)

@@ -263,7 +263,7 @@ def _simulated(problem: FitProblem, part: Part, task: AbstractTask, seeds: int) 
     still = settled(task) if problem.control else task
     key = fold_in(problem.key, 1)
     runs = runs_for_means(still, key, seeds, problem.draws)
-    each, expected = controlled_moments(runs, part.target)
+    each, expected = controlled_moments(runs, part.target, task)
     each = each._replace(power=np.asarray(each.power)[:, part.chosen])
     start = round((runs.time[-1] - STRETCH) * runs.rate)
     # A path of weak numbers is none to look at.

@@ -345,7 +345,7 @@ def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moment
         runs = runs_for_means(settled(task), fold_in(problem.key, 2), problem.seeds, problem.draws)
     except (SimulationError, ValueError):
         return None  # the check on fresh seeds meets the same error and reports it
-    each, expected = controlled_moments(runs, part.target)
+    each, expected = controlled_moments(runs, part.target, task)
     if expected is None:
         return None
     mean = jax.tree.map(lambda x: np.asarray(x).mean(axis=0), each)

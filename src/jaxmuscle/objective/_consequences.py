@@ -14,10 +14,11 @@ from jaxmuscle.model._parameters import paths_of, set_parameters
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.response._rows import Near, mechanical_rows, value_and_slopes
+from jaxmuscle.response._linearised import Near, value_and_slopes
+from jaxmuscle.response._rows import mechanical_rows
 from jaxmuscle.response._transfer import half_power_level
 
-from ._derived import derived_names, of_muscle, of_spectrum
+from ._derived import derived_names, has_tangents, of_muscle, of_spectrum
 from ._moment_models import Linear
 from ._residuals import Data, PartResiduals, Residuals, data_residuals, free_size
 
@@ -168,9 +169,9 @@ def _muscles(
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     def one(near, time, scale):
         def found(both):
-            there = set_parameters(task, dict(zip(names, both[:-1], strict=True)))
-            system = near.at(both[:-1])
-            return of_muscle(there, system, both[-1], system.rest * scale)
+            values, moved = dict(zip(names, both[:-1], strict=True)), has_tangents(task)
+            there = set_parameters(task, values) if moved else None
+            return of_muscle(near.at(both[:-1]), both[-1], there, scale)
 
         return value_and_slopes(found, jnp.append(near.values, time))
 
@@ -194,8 +195,8 @@ def _levels(
 ) -> tuple[Array, Array]:
     def one(near, time, log_f):
         def found(both):
-            there = set_parameters(task, dict(zip(names, both[:-1], strict=True)))
-            return half_power_level(near.at(both[:-1]), there.muscle.base()[0], both[-1], log_f)
+            point = near.at(both[:-1])
+            return half_power_level(point.system, point.base[0], both[-1], log_f)
 
         return value_and_slopes(found, jnp.append(near.values, time))
 

@@ -16,7 +16,7 @@ from jaxmuscle.model._signals import AbstractSignal
 from jaxmuscle.model._tasks import PrescribedLength
 from jaxmuscle.response._equilibrium import HOLD, slowest
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.response._linearised import Linearisation
+from jaxmuscle.response._linearised import Operating
 from jaxmuscle.response._transfer import half_power_frequency
 from jaxmuscle.spectra._fluctuations import BANDS, EDGES, in_bands
 
@@ -148,17 +148,16 @@ def tangents(task: Any, mean: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
 
 
 def of_muscle(
-    task: Any, system: Linearisation, time: Scalar, mean: Scalar
+    point: Operating, time: Scalar, moved: Any = None, scale: Scalar = 1.0
 ) -> dict[str, Float[Array, ""]]:
-    """What follows from the mechanics of a bare task, the contraction time T of its activation (0:
-    none) and its mean output: `corner_frequency` |λ_slow|/2π of the operating point;
-    `half_power_frequency` of the slow part, relaxation and activation together; the base
-    coefficients; where the insertion is moved `tangents`."""
-    base = task.muscle.base()
-    found = dict(zip(BASE, base, strict=True))
-    found["corner_frequency"] = slowest(system.A) / (2 * jnp.pi)
-    found["half_power_frequency"] = half_power_frequency(system, base[0], time)
-    return found | (tangents(task, mean) if has_tangents(task) else {})
+    """What follows from the operating point, the contraction time T of the activation (0: none),
+    the task if its insertion is `moved`, and what its mean is multiplied by: `corner_frequency`
+    |λ_slow|/2π of the operating point; `half_power_frequency` of the slow part, relaxation and
+    activation together; the base coefficients; where the insertion is moved `tangents`."""
+    found = dict(zip(BASE, point.base, strict=True))
+    found["corner_frequency"] = slowest(point.system.A) / (2 * jnp.pi)
+    found["half_power_frequency"] = half_power_frequency(point.system, point.base[0], time)
+    return found | ({} if moved is None else tangents(moved, point.system.rest * scale))
 
 
 def of_spectrum(

@@ -17,7 +17,8 @@ from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
-from jaxmuscle.response._expected import Moments, log_variation_sd
+from jaxmuscle.response._expected import Moments
+from jaxmuscle.response._expected_moments import variation_sd
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.simulation._simulate import DURATION, MAX_RATE_STEP, steps_per_sample
@@ -40,7 +41,7 @@ MOST_SUBSTEPS = 16
 def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[Any, Any] | None:
     """Log coefficient of variation of a target and its standard deviation.
 
-    With a task and where the target states its segments: `log_variation_sd` of recordings that give
+    With a task and where the target states its segments: `variation_sd` of recordings that give
     so many. Else half the relative error of the power in the bins, `½ √(pᵀ V p)` with V the
     covariance of the log powers, which is too much where power lies elsewhere or in a harmonic. The
     `mean_error` of several trials where their scatter is larger.
@@ -52,8 +53,8 @@ def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[
     p = np.asarray(target.proportional_power)
     sd: Any = 0.5 * np.sqrt(p @ bin_statistics(target).covariance @ p)
     if task is not None and target.segments is not None:
-        settings, counts, arrays = target.settings, target.segments, as_arrays(task)
-        each = {k: log_variation_sd(arrays, settings, samples_of(k, settings)) for k in set(counts)}
+        settings, counts = target.settings, target.segments
+        each = {k: variation_sd(task, settings, samples_of(k, settings)) for k in set(counts)}
         each = as_numbers(each) if all_concrete(each) else each
         sd = sum(each[k] ** 2 for k in counts) ** 0.5 / len(counts)
     sd = mean_error(logs, sd)

@@ -17,7 +17,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._decimation import FINER, REACH, anti_alias
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from ._linearised import Linearisation
+from ._linearised import Linearisation, balanced
 
 SHORT = 4
 KINK = 10  # values of r from lag 0 on that say what its kink does to a sum
@@ -39,6 +39,13 @@ class Chain(NamedTuple):
         rows = jnp.pad(self.rows, ((0, 0), (0, n)))
         return Chain(matrix, jnp.concatenate([self.white, white]), rows)
 
+    def split(self, channels: int) -> "list[Chain]":
+        """Parts of at most so many channels, which are independent of each other."""
+        return [
+            self._replace(rows=self.rows[i : i + channels])
+            for i in range(0, len(self.rows), channels)
+        ]
+
     def filled(self, size: int, noises: int, channels: int) -> "Chain":
         """The same in a larger shape: with states that nothing drives or reads, and zeros."""
         (channel, n), noise = self.rows.shape, self.white.shape[1]
@@ -52,14 +59,15 @@ class Chain(NamedTuple):
 
 
 def chains(task: AbstractTask, system: Linearisation) -> list[list[Chain]]:
-    """What the output gets of the noise: of each of its components a sum of independent parts.
+    """What the output gets of the noise: of each of its components a sum of independent parts. Of a
+    `balanced` system.
 
     The response `C (s - A)⁻¹ b + d + s e` to a scalar noise that acts on several inputs with b, d,
     e each: its states are those of the transposed system, `p' = Aᵀ p + Cᵀ N`, of which every input
     reads `b p + d N + e N'`. So all inputs that get a noise of the same colour have one small
     system, whatever their number.
     """
-    found, system = [], _balanced(system)
+    found = []
     for noise in task.noise.components:
         passes = [task.activation is not None and i in ACTIVE for i in noise.acts_on]
         groups = [
@@ -70,25 +78,6 @@ def chains(task: AbstractTask, system: Linearisation) -> list[list[Chain]]:
         apart = [groups] if noise.shared else [[group] for group in groups]
         found.append([_of_groups(task, system, noise, own) for own in apart])
     return found
-
-
-def _balanced(system: Linearisation) -> Linearisation:
-    """The system in units of its states in which rows and columns of A are of one size: single
-    precision needs it."""
-    A = jax.lax.stop_gradient(jnp.abs(system.A)) * (
-        1 - jnp.eye(len(system.A), dtype=system.A.dtype)
-    )
-    scale = jnp.ones(len(A), A.dtype)
-    for _ in range(2):
-        for i in range(len(A)):
-            row, column = jnp.sum(A[i] * scale) / scale[i], jnp.sum(A[:, i] / scale) * scale[i]
-            fits = (row > 0) & (column > 0)
-            ratio = jnp.where(fits, row, 1.0) / jnp.where(fits, column, 1.0)
-            scale = scale.at[i].multiply(jnp.sqrt(ratio))
-    size = jax.lax.stop_gradient(jnp.linalg.norm(system.C * scale))
-    size = jnp.where(size > 0, size, 1.0)
-    A = system.A * scale / scale[:, None]
-    return system._replace(A=A, B=size * system.B / scale[:, None], C=system.C * scale / size)
 
 
 def _of_groups(
@@ -158,7 +147,7 @@ class Covariances(NamedTuple):
 def covariances(task: AbstractTask, system: Linearisation) -> list[list[Covariances]]:
     """The stationary response to the noise: of each of its components a sum of independent
     parts."""
-    return [[Covariances.of(part) for part in own] for own in chains(task, system)]
+    return [[Covariances.of(part) for part in own] for own in chains(task, balanced(system))]
 
 
 def stacked(parts: list[Chain], size: int = 0, channels: int = 0) -> Chain:
@@ -361,7 +350,7 @@ def autocovariances(
 ) -> tuple[Autocovariance, list[int]]:
     """Of every independent part of the noise, along a leading axis; which component of the noise
     each belongs to."""
-    parts = [(own, i) for i, each in enumerate(chains(task, system)) for own in each]
+    parts = [(own, i) for i, each in enumerate(chains(task, balanced(system))) for own in each]
     found = autocovariance(
         stacked([own for own, _ in parts]), 1 / settings.rate, lags, settings.sampling, recorded
     )

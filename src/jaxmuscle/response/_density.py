@@ -4,15 +4,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle._common.arrays import as_arrays, as_doubles
-from jaxmuscle._common.programs import kept
 from jaxmuscle.model._task import AbstractTask
 
-from ._autocovariance import Covariances, covariances
-from ._equilibrium import mechanics
-from ._linearised import linearisation
-
-_covariances = kept(covariances)
+from ._rows import noise_parts
 
 
 def noise_density(
@@ -20,17 +14,21 @@ def noise_density(
 ) -> Float[np.ndarray, "components frequencies"]:
     """One-sided power density [unit²/Hz] that each component of the noise makes, to first order.
 
-        S(f) = 4 Re Σ row (2πi f - 𝒜)⁻¹ start,    r(τ) = Σ row exp(𝒜 τ) start
+        S(f) = 2 Σ |row (2πi f - 𝒜)⁻¹ white|²,    x' = 𝒜 x + white w
 
     Of the output itself: no sampling, no low-pass, no harmonic.
     """
     with jax.enable_x64(True):
-        found = _covariances(as_doubles(as_arrays(task)), linearisation(mechanics(task)))
+        parts, component = noise_parts(task)
     s = 2j * np.pi * np.asarray(frequency)[:, None, None]
-    return np.array([np.sum([_density(own, s) for own in each], axis=0) for each in found])
+    each = np.array([_density(*part, s) for part in zip(*parts, strict=True)])
+    return np.array(
+        [np.sum(each[component == i], axis=0) for i in range(len(task.noise.components))]
+    )
 
 
-def _density(system: Covariances, s: np.ndarray) -> Float[np.ndarray, " frequencies"]:
-    matrix, rows, start = map(np.asarray, system)
-    inside = np.linalg.solve(s * np.eye(len(matrix)) - matrix, start.T[None])
-    return 4 * np.real(np.einsum("cs,fsc->f", rows, inside))
+def _density(
+    matrix: np.ndarray, white: np.ndarray, rows: np.ndarray, s: np.ndarray
+) -> Float[np.ndarray, " frequencies"]:
+    inside = np.linalg.solve(s * np.eye(len(matrix)) - matrix, white[None].astype(s.dtype))
+    return 2 * np.sum(np.abs(rows @ inside) ** 2, axis=(1, 2))

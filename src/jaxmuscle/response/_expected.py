@@ -9,13 +9,11 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
-from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._bin_law import bin_rows, sides_of
-from jaxmuscle.spectra._settings import LONGEST, WINDOW, SpectrumSettings, samples_in, tapers_of
+from jaxmuscle.spectra._settings import LONGEST, SpectrumSettings, samples_in, tapers_of
 
 from ._autocovariance import autocovariances, covariances
 from ._harmonic_line import LONG, harmonic_line, removed, transformed
@@ -23,8 +21,6 @@ from ._linearised import Linearisation, linearise
 
 TAIL = 1e-13
 ROUNDING = 1e-20  # of any unit of the output: fluctuations that are smaller are none
-# a program is made for so many samples, for 4 times, 16 times ... as many, and serves all below
-LAGS = 4096
 
 
 class Moments(NamedTuple):
@@ -201,43 +197,30 @@ def response(
 
 
 def log_variation_sd(
-    task: AbstractTask, settings: SpectrumSettings, samples: int
+    r: Float[Array, " lags"],
+    spread: Float[Array | np.ndarray, " around"],
+    slow: Scalar,
+    swing: Scalar,
+    turns: Scalar,
+    samples: Int[Array | np.ndarray, ""] | int,
 ) -> Float[Array, ""]:
     """Standard deviation of the log of the coefficient of variation of so many successive samples,
     in linear response.
 
-    For low-passed Gaussian noise of autocovariance r and a line of mean square h at the frequency
-    f, s² that of both,
+    For low-passed Gaussian noise of autocovariance r, `spread` by the low-pass, and a line of mean
+    square h (`swing`) that makes so many `turns` in an interval, s² that of both,
 
         Var s² = 2/n Σ_l (1 - |l|/n) r̃(lΔ)² + 4h/n Σ_l (1 - |l|/n) r̃(lΔ) cos(2πf lΔ)
         r̃ = r - Var(mean),
 
-    and sd(ln CV) = √(Var s²) / (2 s²). How the mean scatters is left out: it counts as CV² beside
-    this.
+    Var(mean) = `slow`, and sd(ln CV) = √(Var s²) / (2 s²). How the mean scatters is left out: it
+    counts as CV² beside this.
     """
-    most = LAGS
-    while most < samples:
-        most *= 4
-    return _log_variation_sd(as_arrays(task), settings, as_arrays(samples, int), most)
-
-
-@kept
-def _log_variation_sd(
-    task: AbstractTask, settings: SpectrumSettings, samples: Int[Array | np.ndarray, ""], most: int
-) -> Float[Array, ""]:
-    """Of any number of samples up to the `most`, in one program: trials are rarely of one
-    length."""
-    system = linearise(task)
-    spread = jnp.asarray(low_pass_spread(settings), system.A.dtype)
     reach = len(spread) // 2
-    each, _ = autocovariances(task, system, settings, most + reach)
-    r = jnp.sum(each.lagged(most + reach), axis=0)
-    slow = jnp.sum(each.mean_variance(samples))
     r = jnp.convolve(jnp.concatenate([r[reach:0:-1], r]), spread, mode="valid") - slow
-    _, swing = harmonic_line(task, system, settings, WINDOW, samples)
-    lag, n = jnp.arange(most, dtype=r.dtype), jnp.asarray(samples, r.dtype)
+    lag, n = jnp.arange(len(r), dtype=r.dtype), jnp.asarray(samples, r.dtype)
     weight = jnp.where(lag > 0, 2.0, 1.0) * jnp.maximum(1 - lag / n, 0.0) / n
-    turning = jnp.cos(2 * np.pi * task.harmonic.frequency * lag / settings.rate)
+    turning = jnp.cos(2 * np.pi * turns * lag)
     variance = jnp.sum(weight * (2 * r**2 + 4 * swing * r * turning))
     return 0.5 * jnp.sqrt(variance) / (r[0] + swing)
 

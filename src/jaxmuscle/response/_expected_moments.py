@@ -3,17 +3,22 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
-from jaxmuscle._common.arrays import all_concrete
+from jaxmuscle._common.arrays import all_concrete, as_arrays
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings, samples_in
 from jaxmuscle.spectra._welch import Spectrum
 
-from ._expected import Moments, response
-from ._linearised import Linearisation
-from ._rows import Sampled, moments_of_rows
+from ._autocovariance import autocovariances
+from ._expected import Moments, log_variation_sd, low_pass_spread, response
+from ._harmonic_line import harmonic_line
+from ._linearised import Linearisation, linearise
+from ._rows import Sampled, moments_of_rows, variation_sd_of_numbers
+
+# a program is made for so many samples, for 4 times, 16 times ... as many, and serves all below
+LAGS = 4096
 
 
 def expected_moments(
@@ -30,6 +35,31 @@ def expected_moments(
     sampled = Sampled(settings, window, samples, recorded)
     moments, _, system = moments_of_rows(task, (), np.zeros((1, 0)), sampled)
     return jax.tree.map(lambda x: jnp.asarray(x[0]), (moments, system))
+
+
+def variation_sd(
+    task: AbstractTask, settings: SpectrumSettings, samples: int
+) -> Float[Array | np.ndarray, ""]:
+    """`log_variation_sd` of a task's output; of numbers by the programs of `moments_of_rows`."""
+    most = LAGS
+    while most < samples:
+        most *= 4
+    spread = low_pass_spread(settings)
+    lags = most + len(spread) // 2
+    if all_concrete(task):
+        return variation_sd_of_numbers(task, Sampled(settings, WINDOW, samples, 0.0), lags)
+    task = as_arrays(task)
+    system = linearise(task)
+    each, _ = autocovariances(task, system, settings, lags)
+    _, swing = harmonic_line(task, system, settings, WINDOW, samples)
+    return log_variation_sd(
+        jnp.sum(each.lagged(lags), axis=0),
+        jnp.asarray(spread, system.A.dtype),
+        jnp.sum(each.mean_variance(samples)),
+        swing,
+        task.harmonic.frequency / settings.rate,
+        samples,
+    )
 
 
 def linear_spectrum(

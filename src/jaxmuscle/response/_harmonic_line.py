@@ -202,7 +202,8 @@ def _wave(angle: Float[Array, ""], count: int) -> tuple[Array, Array]:
     fine = angle * np.arange(few, dtype=angle.dtype)
     coarse = (angle * few) * np.arange(-(-count // few), dtype=angle.dtype)[:, None]
     c, s, cos, sin = jnp.cos(fine), jnp.sin(fine), jnp.cos(coarse), jnp.sin(coarse)
-    return tuple(x.reshape(-1)[:count] for x in (cos * c - sin * s, sin * c + cos * s))
+    both = (cos * c - sin * s).reshape(-1), (sin * c + cos * s).reshape(-1)
+    return both[0][:count], both[1][:count]
 
 
 def table_of(

@@ -13,7 +13,7 @@ from jaxmuscle._common.programs import kept
 from jaxmuscle.model._parameters import INPUTS
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
 
-from ._equilibrium import HOLD, mechanics
+from ._equilibrium import HOLD
 from ._linearised import Linearisation, check_equilibrium, check_inputs, linearisation, linearise
 from ._transfer import SignalSystem, polynomial, polynomials, system_of, times_i
 
@@ -101,7 +101,7 @@ def _density(task: Any, f: Any) -> Float[Array, " frequencies"]:
 def _checked(task: AbstractTask) -> None:
     if all_concrete(task):
         check_inputs(task)
-        system = linearisation(mechanics(task))
+        system = linearisation(task)
         check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import operator
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -10,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import as_arrays, as_doubles, as_numbers, is_concrete
+from jaxmuscle._common.arrays import all_concrete, as_arrays, as_doubles, as_numbers, is_concrete
 from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
-from jaxmuscle.model._muscle import Perturbation
-from jaxmuscle.model._signals import AbstractSignal, Constant
+from jaxmuscle.model._muscle import Muscle, Perturbation
+from jaxmuscle.model._parameters import USUALLY_FREE, paths_of, set_parameters
+from jaxmuscle.model._signals import AbstractSignal, Constant, SmoothStep
 from jaxmuscle.model._tasks import AbstractTask, State
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -97,6 +99,188 @@ def _sum(row: Array, values: Any) -> Array:
     return functools.reduce(operator.add, (row[i] * values[i] for i in range(len(row))))
 
 
+POINTS, LATEST = 32, 8
+# free with a known mean force, with a moved insertion and in designs
+SOMETIMES = ("P_w", "m_w", "m_z")
+NOT_MECHANICAL = ("noise", "harmonic", "activation")
+
+
+def program_names(task: AbstractTask, own: Sequence[str] = ()) -> tuple[str, ...]:
+    """The names that a program has slopes for: of the usually free ones those that the task has, in
+    one order whatever is asked for, then other ones of one's `own`."""
+    known = task.parameter_names
+    usual = (name for name in (*USUALLY_FREE, *SOMETIMES) if name in known)
+    return tuple(dict.fromkeys([*usual, *own]))
+
+
+class Operating(NamedTuple):
+    """A linearisation, the same `balanced`, and K_w0, K_z0, C_w0 and C_z0."""
+
+    system: Linearisation
+    balanced: Linearisation
+    base: Float[Array, "4"]
+
+
+class Near(NamedTuple):
+    """The operating point at some mechanical values, and its slopes with respect to them."""
+
+    point: Operating
+    slopes: Operating
+    values: Float[Array, " moving"]
+
+    def at(self, values: Float[Array, " moving"]) -> Operating:
+        """To first order, which gives its value and its slope there exactly."""
+        away = values - self.values
+        return jax.tree.map(lambda x, slope: x + slope @ away, self.point, self.slopes)
+
+
+def value_and_slopes(function: Callable[[Any], Any], at: Any) -> tuple[Any, Any]:
+    """A function's value and its Jacobian."""
+
+    def twice(at):
+        value = function(at)
+        return value, value
+
+    slopes, value = jax.jacfwd(twice, has_aux=True)(at)
+    return value, slopes
+
+
+@kept
+def _operating_points(
+    task: AbstractTask,
+    names: tuple[str, ...],
+    time: Any,
+    values: Float[Array | np.ndarray, "points names"],
+) -> tuple[Operating, Operating]:
+    """Of a bare task with each row of its mechanical values, and the slopes."""
+
+    def one(values):
+        there = set_parameters(task, dict(zip(names, values, strict=True)))
+        system = linearise(there, time)
+        return Operating(system, balanced(system), there.muscle.base())
+
+    return jax.vmap(lambda values: value_and_slopes(one, values))(values)
+
+
+def balanced(system: Linearisation) -> Linearisation:
+    """The system in units of its states in which rows and columns of A are of one size: single
+    precision needs it."""
+    A = jax.lax.stop_gradient(jnp.abs(system.A)) * (
+        1 - jnp.eye(len(system.A), dtype=system.A.dtype)
+    )
+    scale = jnp.ones(len(A), A.dtype)
+    for _ in range(2):
+        for i in range(len(A)):
+            row, column = jnp.sum(A[i] * scale) / scale[i], jnp.sum(A[:, i] / scale) * scale[i]
+            fits = (row > 0) & (column > 0)
+            ratio = jnp.where(fits, row, 1.0) / jnp.where(fits, column, 1.0)
+            scale = scale.at[i].multiply(jnp.sqrt(ratio))
+    size = jax.lax.stop_gradient(jnp.linalg.norm(system.C * scale))
+    size = jnp.where(size > 0, size, 1.0)
+    A = system.A * scale / scale[:, None]
+    return system._replace(A=A, B=size * system.B / scale[:, None], C=system.C * scale / size)
+
+
+class Bearer(Muscle):
+    """A muscle of which only the base coefficients are known: what noise and harmonic are fractions
+    of."""
+
+    coefficients: Float[Array | np.ndarray, "4"] | None = None
+
+    def base(self) -> Float[Array, "4"]:
+        return jnp.asarray(self.coefficients)
+
+
+class Mechanics:
+    """One task to be linearised with many values of its `own` parameters.
+
+    `bare`: what its mechanics depend on, with the names of the `moving` values; `bearer`: what its
+    noise and its line depend on besides the operating point; `names`: all that programs have slopes
+    for, of which the moving ones are at `place`.
+    """
+
+    def __init__(self, task: AbstractTask, own: tuple[str, ...]):
+        self.task, self.own, self.names = task, own, program_names(task, own)
+        self.dtype = jnp.result_type(float)
+        self.defaults = np.array([float(task[name]) for name in self.names])
+        self.columns = np.array([self.names.index(name) for name in own], dtype=int)
+        self.bare, paths = mechanics(task), paths_of(task)
+        place = [i for i, n in enumerate(self.names) if paths[n][0] not in NOT_MECHANICAL]
+        self.place, self.moving = np.array(place, dtype=int), tuple(self.names[i] for i in place)
+        self.seen: dict[float, tuple[np.ndarray, Near]] = {}
+
+    @classmethod
+    def of(cls, task: AbstractTask, own: Sequence[str] = ()) -> "Mechanics":
+        """Of the latest tasks made only once: to prepare one takes longer than to linearise it."""
+        for known in _LATEST:
+            if (known.task is task, known.own, known.dtype) == (
+                True,
+                tuple(own),
+                jnp.result_type(float),
+            ):
+                return known
+        found = cls(task, tuple(own))
+        _LATEST[:] = [found, *_LATEST[: LATEST - 1]]
+        return found
+
+    @functools.cached_property
+    def bearer(self) -> LinearTask:
+        """With the linearisation of the task itself."""
+        common: Any = self.task.with_parts(settings=self.bare.settings).common
+        found = self.at(np.zeros((1, len(self.own))) + self.defaults[self.columns])[1].point
+        point = jax.tree.map(lambda x: x[0], found)
+        return as_arrays(
+            LinearTask(point.system, **(common | {"muscle": Bearer(coefficients=point.base)}))
+        )
+
+    def at(
+        self, values: Float[np.ndarray, "rows own"], time: float = HOLD
+    ) -> tuple[np.ndarray, Near]:
+        """Values of all names, and the operating points there."""
+        whole = np.tile(self.defaults, (len(values), 1))
+        whole[:, self.columns] = values
+        whole = as_arrays(whole)
+        known = self.seen.get(time)
+        if known is None or not np.array_equal(whole, known[0]):
+            moving = whole[:, self.place]
+            task = held_up(self.bare) if time == HOLD else self.bare
+            program = functools.partial(_operating_points, task, self.moving, as_arrays(time))
+            known = self.seen[time] = whole, Near(*in_parts(program, moving), moving)
+        return known
+
+
+_LATEST: list[Mechanics] = []
+
+
+def held_up(task: AbstractTask) -> AbstractTask:
+    """The task with steps that are over at `HOLD` as constants: a program serves both."""
+    levels = {
+        name: Constant(signal.level)
+        for name, signal in _signals(task).items()
+        if type(signal) is SmoothStep and float(signal.start + signal.rise) <= HOLD
+    }
+    return task.with_parts(**levels) if levels else task
+
+
+def in_parts(program: Callable[..., Any], *rows: Any) -> Any:
+    """What a program for `POINTS` rows makes of any number of them, as numbers."""
+    count = len(jax.tree.leaves(rows)[0])
+    found = []
+    for i in range(0, count, POINTS):
+        here = np.minimum(np.arange(i, i + POINTS), count - 1)
+        made = program(*jax.tree.map(lambda x, here=here: np.asarray(x)[here], rows))
+        found.append(jax.tree.map(lambda x, n=count - i: np.asarray(x)[:n], made))
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+
+
+def linearisation(task: AbstractTask, time: float = HOLD) -> Linearisation:
+    """`linearise`; of a task of numbers by the program that fits use."""
+    if isinstance(task, LinearTask) or not all_concrete(task):
+        return linearise(task, time)
+    mechanics_of = Mechanics.of(task)
+    return jax.tree.map(lambda x: x[0], mechanics_of.at(np.zeros((1, 0)), time)[1].point.system)
+
+
 def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     """The task with its inputs held at their values at `time` [s] from the start, and starting from
     equilibrium.
@@ -107,9 +291,7 @@ def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     """
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
     point = (
-        equilibrium(task, time)
-        if traced
-        else np.asarray(linearisation(mechanics(task), time).point).tolist()
+        equilibrium(task, time) if traced else np.asarray(linearisation(task, time).point).tolist()
     )
     levels = _inputs(_signals(as_arrays(task)), np.array([time]))
     held = {
@@ -134,12 +316,9 @@ def _signals(task: AbstractTask) -> dict[str, AbstractSignal]:
     return {name: value for name, value in found.items() if isinstance(value, AbstractSignal)}
 
 
-linearisation = kept(linearise)  # of what `mechanics` gives: one program for tasks of any settings
-
-
 def linearised(task: AbstractTask, time: float = HOLD) -> LinearTask:
     """`LinearTask.of`, compiled."""
-    return LinearTask.of(as_arrays(task), linearisation(mechanics(task), time))
+    return LinearTask.of(as_arrays(task), linearisation(task, time))
 
 
 def check_equilibrium(task: Any, point: np.ndarray, A: np.ndarray) -> float:
@@ -197,7 +376,7 @@ def has_response(task: AbstractTask, *, required: bool) -> bool:
     """Whether a task has a stable, damped equilibrium under held inputs; with `required`, why not
     is an error."""
     with jax.enable_x64(True):
-        system = linearisation(mechanics(task))
+        system = linearisation(task)
         try:
             check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
             check_inputs(task)

@@ -9,6 +9,7 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,15 +19,21 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._activation import ACTIVE
-from jaxmuscle.model._parameters import USUALLY_FREE, paths_of, set_parameters
+from jaxmuscle.model._parameters import set_parameters
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._signals import Constant
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.spectra._settings import LONGEST, SpectrumSettings
+from jaxmuscle.spectra._settings import LONGEST, WINDOW, SpectrumSettings
 
 from ._autocovariance import DECAY, Chain, autocovariance, chains, stacked
-from ._equilibrium import HOLD, mechanics
-from ._expected import Moments, covariance_operator, expected_powers, lags_of
+from ._expected import (
+    Moments,
+    covariance_operator,
+    expected_powers,
+    lags_of,
+    log_variation_sd,
+    low_pass_spread,
+)
 from ._harmonic_line import (
     LONG,
     LineTable,
@@ -37,26 +44,22 @@ from ._harmonic_line import (
     table_of,
 )
 from ._input_response import parts_of_stiffness
-from ._linearised import Linearisation, LinearTask, linearise
+from ._linearised import (
+    Linearisation,
+    LinearTask,
+    Mechanics,
+    Near,
+    Operating,
+    in_parts,
+    value_and_slopes,
+)
 from ._transfer import SignalSystem, harmonic_system, transfer
 
-POINTS, MANY = 32, 512
-LATEST = 8
+MANY = 512
 BLOCK, FEW, ROWS = 32, 8, 512
-# free with a known mean force, with a moved insertion and in designs
-SOMETIMES = ("P_w", "m_w", "m_z")
 FURTHER = 4  # states of a filter and of an activation behind those of a task
-CHANNELS = 5
+CHANNELS = 2  # of a part; more than these are parts of their own
 LEAST_LAGS, LEAST_BINS = 512, 32
-NOT_MECHANICAL = ("noise", "harmonic", "activation")
-
-
-def program_names(task: AbstractTask, own: Sequence[str] = ()) -> tuple[str, ...]:
-    """The names that a program has slopes for: of the usually free ones those that the task has, in
-    one order whatever is asked for, then other ones of one's `own`."""
-    known = task.parameter_names
-    usual = (name for name in (*USUALLY_FREE, *SOMETIMES) if name in known)
-    return tuple(dict.fromkeys([*usual, *own]))
 
 
 class Sampled(NamedTuple):
@@ -109,48 +112,15 @@ class _Line(NamedTuple):
     frequency: Float[Array | np.ndarray, ""]
 
 
-class Near(NamedTuple):
-    """A linearisation and its slopes with respect to the mechanical values."""
-
-    system: Linearisation
-    slopes: Linearisation
-    values: Float[Array | np.ndarray, " moving"]
-
-    def at(self, values: Float[Array | np.ndarray, " moving"]) -> Linearisation:
-        """To first order, which gives its value and its slope there exactly."""
-        away = values - self.values
-        return jax.tree.map(lambda x, slope: x + slope @ away, self.system, self.slopes)
-
-
-def value_and_slopes(function: Callable[[Any], Any], at: Any) -> tuple[Any, Any]:
-    """A function's value and its Jacobian."""
-
-    def twice(at):
-        value = function(at)
-        return value, value
-
-    slopes, value = jax.jacfwd(twice, has_aux=True)(at)
-    return value, slopes
-
-
-@kept
-def _linearisations_of(
-    task: AbstractTask,
-    names: tuple[str, ...],
-    values: Float[Array | np.ndarray, "points names"],
-    time: Scalar | np.ndarray,
-) -> tuple[Linearisation, Linearisation]:
-    """Of a bare task with each row of its mechanical values, and the slopes."""
-
-    def one(values):
-        return linearise(set_parameters(task, dict(zip(names, values, strict=True))), time)
-
-    return jax.vmap(lambda values: value_and_slopes(one, values))(values)
-
-
-def _with_values(task: LinearTask, names: tuple[str, ...], values: Array) -> AbstractTask:
+def _with_values(
+    task: LinearTask, names: tuple[str, ...], values: Array, point: Operating
+) -> AbstractTask:
+    """The bearer with these values of noise, harmonic and activation, and base coefficients."""
     own = task.parameter_names
-    return set_parameters(task, {n: v for n, v in zip(names, values, strict=True) if n in own})
+    return set_parameters(
+        eqx.tree_at(lambda t: t.muscle.coefficients, task, point.base),
+        {n: v for n, v in zip(names, values, strict=True) if n in own},
+    )
 
 
 @kept
@@ -167,8 +137,11 @@ def _made(
 
     def one(values, near):
         def made(values):
-            there, system = _with_values(task, names, values), near.at(values[place])
-            parts = [part for own in chains(there, system) for part in own]
+            point = near.at(values[place])
+            there, system = _with_values(task, names, values, point), point.balanced
+            parts = [
+                few for own in chains(there, system) for part in own for few in part.split(CHANNELS)
+            ]
             line = None
             if isinstance(task.harmonic.envelope, Constant):
                 reply = harmonic_size(there, system.A.dtype)
@@ -205,8 +178,10 @@ def _enveloped(
 
     def one(values, near):
         def line(values):
-            there = _with_values(task, names, values)
-            return harmonic_line(there, near.at(values[place]), *sampled, 1)
+            point = near.at(values[place])
+            return harmonic_line(
+                _with_values(task, names, values, point), point.balanced, *sampled, 1
+            )
 
         return value_and_slopes(line, values)
 
@@ -222,7 +197,7 @@ def _stiffness(
     def one(near):
         def parts(values):
             there = set_parameters(task, dict(zip(names, values, strict=True)))
-            return parts_of_stiffness(there, near.at(values), f)
+            return parts_of_stiffness(there, near.at(values).system, f)
 
         return value_and_slopes(parts, near.values)
 
@@ -314,69 +289,6 @@ def _line_rows(
         return table.power(reply), table.variance(reply)
 
     return _in_blocks(lambda given: jax.vmap(one)(*given), given, towards, count)
-
-
-class Mechanics:
-    """One task to be linearised with many values of its `own` parameters.
-
-    `bare`: what its mechanics depend on, with the names of the `moving` values; `bearer`: what its
-    noise and its line depend on besides the linearisation; `names`: all that programs have slopes
-    for, of which the moving ones are at `place`.
-    """
-
-    def __init__(self, task: AbstractTask, own: tuple[str, ...]):
-        self.task, self.own, self.names = task, own, program_names(task, own)
-        self.defaults = np.array([float(task[name]) for name in self.names])
-        self.columns = np.array([self.names.index(name) for name in own], dtype=int)
-        self.bare, paths = mechanics(task), paths_of(task)
-        place = [i for i, n in enumerate(self.names) if paths[n][0] not in NOT_MECHANICAL]
-        self.place, self.moving = np.array(place, dtype=int), tuple(self.names[i] for i in place)
-        self.seen: tuple[np.ndarray, Near] | None = None
-
-    @classmethod
-    def of(cls, task: AbstractTask, own: Sequence[str]) -> "Mechanics":
-        """Of the latest tasks made only once: to prepare one takes longer than to linearise it."""
-        for known in _LATEST:
-            if known.task is task and known.own == tuple(own):
-                return known
-        found = cls(task, tuple(own))
-        _LATEST[:] = [found, *_LATEST[: LATEST - 1]]
-        return found
-
-    @functools.cached_property
-    def bearer(self) -> LinearTask:
-        """With any linearisation of that many states."""
-        assert self.seen is not None
-        nothing = jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), self.seen[1].system)
-        usual = self.bare.settings
-        return as_arrays(LinearTask(nothing, **self.task.with_parts(settings=usual).common))
-
-    def at(self, values: Float[np.ndarray, "rows own"]) -> tuple[np.ndarray, Near]:
-        """Values of all names, and the linearisations there."""
-        whole = np.tile(self.defaults, (len(values), 1))
-        whole[:, self.columns] = values
-        whole = as_arrays(whole)
-        if self.seen is None or not np.array_equal(whole, self.seen[0]):
-            time, moving = as_arrays(HOLD), whole[:, self.place]
-            found = in_parts(
-                lambda some: _linearisations_of(self.bare, self.moving, some, time), moving
-            )
-            self.seen = whole, Near(*found, moving)
-        return self.seen
-
-
-_LATEST: list[Mechanics] = []
-
-
-def in_parts(program: Callable[..., Any], *rows: Any) -> Any:
-    """What a program for `POINTS` rows makes of any number of them, as numbers."""
-    count = len(jax.tree.leaves(rows)[0])
-    found = []
-    for i in range(0, count, POINTS):
-        here = np.minimum(np.arange(i, i + POINTS), count - 1)
-        made = program(*jax.tree.map(lambda x, here=here: np.asarray(x)[here], rows))
-        found.append(jax.tree.map(lambda x, n=count - i: np.asarray(x)[:n], made))
-    return jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 
 def mechanical_rows(
@@ -488,26 +400,26 @@ class _Many(NamedTuple):
     along: tuple[str, ...]
     sampled: Sampled
 
-    def moments(
-        self, values: np.ndarray, points: np.ndarray | None
-    ) -> tuple[Moments, Moments, Linearisation]:
-        """Of some rows."""
+    def made(self, values: np.ndarray) -> tuple[Any, ...]:
+        """What is known of some rows, and what the large programs take of them."""
         here = Mechanics.of(self.task, self.own)
         columns = np.array([here.names.index(name) for name in self.along], dtype=int)
         whole, near = here.at(values)
         program = functools.partial(_made, here.bearer, here.names, here.place)
         made, by = in_parts(program, whole, near)
-        by = jax.tree.map(lambda x: x[..., columns], by)
+        return here, whole, near, columns, made, jax.tree.map(lambda x: x[..., columns], by)
+
+    def moments(
+        self, values: np.ndarray, points: np.ndarray | None
+    ) -> tuple[Moments, Moments, Linearisation]:
+        """Of some rows."""
+        here, whole, near, columns, made, by = self.made(values)
 
         def widened(slope: Any) -> np.ndarray:
             return _widened(slope, here.moving, self.along)
 
         power, variance, by_power, by_variance, resonant, by_resonant = self._noise(made, by)
-        line, swing, by_line, by_swing = (
-            self._line(made.line, by.line)
-            if made.line is not None
-            else self._enveloped(here, columns, whole, near)
-        )
+        line, swing, by_line, by_swing = self._line(here, whole, near, columns, made.line, by.line)
         stiffness = by_stiffness = ()
         if points is not None:
             f = as_arrays(np.resize(points, -(-len(points) // 64) * 64))
@@ -516,13 +428,13 @@ class _Many(NamedTuple):
             )
             stiffness = stiffness[:, :, : len(points)]
             by_stiffness = widened(slope)[:, :, : len(points)]
-        system = near.system
+        system = near.point.system
         return (
             Moments(power + line, line, system.rest, variance + swing, resonant, stiffness),
             Moments(
                 by_power + by_line,
                 by_line,
-                widened(near.slopes.rest),
+                widened(near.slopes.system.rest),
                 by_variance + by_swing,
                 by_resonant,
                 by_stiffness,
@@ -560,7 +472,11 @@ class _Many(NamedTuple):
         sums = (np.sum(x, axis=1) for x in (power, variance, by_power, by_variance))
         return (*sums, resonant, by_resonant)
 
-    def _line(self, line: Any, by: Any) -> tuple[np.ndarray, ...]:
+    def _line(
+        self, here: Mechanics, whole: Any, near: Near, columns: np.ndarray, line: Any, by: Any
+    ) -> tuple[np.ndarray, ...]:
+        if line is None:
+            return self._enveloped(here, columns, whole, near)
         settings, frequency = self.sampled.settings, line.frequency
         different, back = np.unique(frequency, return_inverse=True)
         segments = (
@@ -602,12 +518,48 @@ class _Many(NamedTuple):
         return line, swing, by_line[..., columns], by_swing[..., columns]
 
 
+def noise_parts(task: AbstractTask) -> tuple[Chain, Int[np.ndarray, " parts"]]:
+    """The parts of a task's noise along a leading axis, and which component each belongs to."""
+    made = _Many(task, (), (), Sampled(task.settings, WINDOW, 0, 0.0)).made(np.zeros((1, 0)))[4]
+    return jax.tree.map(lambda x: x[0], made.parts), _component_of_parts(task)
+
+
+def variation_sd_of_numbers(task: AbstractTask, sampled: Sampled, lags: int) -> float:
+    """`log_variation_sd` of a task's output, good for that many lags."""
+    sampled = sampled._replace(samples=as_arrays(sampled.samples, int))
+    many = _Many(task, (), (), sampled)
+    *known, made, by = many.made(np.zeros((1, 0)))
+    swing = many._line(*known, made.line, by.line)[1][0]
+    parts = made.parts.matrix.shape[1]
+    padded = -(-parts // 4) * 4
+    rows = jax.tree.map(lambda x: x[0, np.minimum(np.arange(padded), parts - 1)], made.parts)
+    settings = sampled.settings
+    found = _variation_sd(
+        rows,
+        as_arrays((np.arange(padded) < parts, low_pass_spread(settings), 1 / settings.rate)),
+        as_arrays((swing, task.harmonic.frequency / settings.rate)),
+        sampled.samples,
+        settings.sampling,
+        lags,
+    )
+    return float(found)
+
+
+@kept
+def _variation_sd(parts, settings, line, samples, sampling, lags):
+    counts, spread, interval = settings
+    each = autocovariance(parts, interval, lags, sampling, 0.0)
+    r, slow = counts @ each.lagged(lags), counts @ each.mean_variance(samples)
+    return log_variation_sd(r, spread, slow, *line, samples)
+
+
 def _component_of_parts(task: AbstractTask) -> np.ndarray:
     """Which component of the noise each of the parts of `chains` belongs to."""
     found = []
     for i, noise in enumerate(task.noise.components):
-        active = {task.activation is not None and j in ACTIVE for j in noise.acts_on}
-        found += [i] * (1 if noise.shared else len(active))
+        passes = [task.activation is not None and j in ACTIVE for j in noise.acts_on]
+        counts = [1] if noise.shared else [passes.count(own) for own in set(passes)]
+        found += [i] * sum(-(-count // CHANNELS) for count in counts)
     return np.array(found)
 
 

@@ -22,7 +22,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.model._white_noise import BandLimitedNoise, WhiteNoise
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
-from ._equilibrium import HOLD, mechanics
+from ._equilibrium import HOLD, without_settings
 from ._expected import Moments, covariance_operator, expected_powers, lags_of
 from ._expected_moments import expected_moments
 from ._harmonic_line import LONG
@@ -174,7 +174,7 @@ class _Looked(NamedTuple):
     def at(cls, task: AbstractTask) -> "_Looked":
         arrays = as_doubles(task)
         with jax.enable_x64(True):
-            bare = mechanics(arrays)
+            bare = without_settings(arrays)
             return cls(bare, jax.tree.map(np.asarray, _parts(bare)))
 
 
