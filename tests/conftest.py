@@ -108,7 +108,11 @@ def _compile_quickly(known: Path) -> None:
 # on who draws them. All others, and what a test compiles itself, are computed a few times: without
 # optimisation they compile in half the time.
 OPTIMISED = {
-    "_of_rows",
+    "_noise_rows",
+    "_line_tables",
+    "_line_rows",
+    "_operating_points",
+    "_made",
     "_moments_and_slopes",
     "_step",
     "_start",
@@ -124,7 +128,6 @@ OPTIMISED = {
     "_folded",
     "_wrapped",
     "_frequencies",
-    "_values",
 }
 
 

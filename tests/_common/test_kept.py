@@ -339,13 +339,13 @@ def test_between_processes(tmp_path):
 
 LOADED = """
 import sys, jax, numpy as np, jaxmuscle as jm
-from jaxmuscle.response import _expected
+from jaxmuscle.response import _rows
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")  # as the tests
 power = np.asarray(jm.expected_spectrum(jm.Isometric()).power)
 heavy = {"diffrax", "optimistix", "scipy.signal", "scipy.stats", "matplotlib", "rich"}
 heavy &= set(sys.modules)
-print(_expected._compiled_response.traces, power.tobytes().hex(), len(heavy))
+print(_rows._noise_rows.traces, power.tobytes().hex(), len(heavy))
 """
 
 

@@ -23,20 +23,21 @@ from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.fits import _search
 from jaxmuscle.fits._checks import AMBIGUOUS, Stage, rivals
 from jaxmuscle.model._noises import with_noise
-from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
+from jaxmuscle.model._parameters import BASE, DEFAULT_FREE, PARAMETERS
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.objective._arguments import DT, RESIDUALS, FitOptions, free_names, planned
-from jaxmuscle.objective._consequences import BATCH, _of_rows, consequences, expand
+from jaxmuscle.objective._consequences import BATCH, consequences, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import common_scales, identifiability
-from jaxmuscle.objective._derived import derived
+from jaxmuscle.objective._derived import of_spectrum
 from jaxmuscle.objective._least_squares import Minima, _residuals, _Standing, least_squares
 from jaxmuscle.objective._moment_models import MonteCarlo, welch_operator
 from jaxmuscle.objective._problem import FitProblem, Part, target_variation
-from jaxmuscle.objective._residuals import residual_sigma
+from jaxmuscle.objective._residuals import data_residuals, residual_sigma
 from jaxmuscle.objective._starts import contenders, halton
 from jaxmuscle.response._equilibrium import slowest_rate
 from jaxmuscle.response._expected import Moments
+from jaxmuscle.response._rows import _noise_rows
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
@@ -505,8 +506,8 @@ def test_the_residuals_vanish_for_a_target_that_the_model_makes(x64):
         moments = _moments(jnp.zeros(3))
         bias = np.exp(objective.statistics.bias) if residual == "log" else 1.0
         made = eqx.tree_at(lambda p: p.data.target, objective, moments.proportional * bias)
-        np.testing.assert_allclose(made.data_residuals(moments, made.data), 0.0, atol=1e-12)
-        shifted = made.data_residuals(_moments(jnp.full(3, 0.2)), made.data)
+        np.testing.assert_allclose(data_residuals(residual, moments, made.data), 0.0, atol=1e-12)
+        shifted = data_residuals(residual, _moments(jnp.full(3, 0.2)), made.data)
         assert np.abs(shifted).max() > 0.1
 
 
@@ -704,9 +705,6 @@ def averaged(task, *, seeds=192, key=99):
     return jm.Target("truth", power, segments=[6] * seeds)
 
 
-_derived = eqx.filter_jit(derived)
-
-
 def true_derived(task):
     """Derived quantities of the truth, its spectrum with a control variate: each seed is worth
     hundreds."""
@@ -716,15 +714,14 @@ def true_derived(task):
     )
     line = quiet.spectrum().power[0]
     held = np.asarray(runs.between())
-    seen = (
-        runs.mean_spectrum().power,
-        line,
-        held.mean(),
-        held.var(axis=1).mean(),
-        slowest_rate(task),
+    seen = runs.mean_spectrum().power, line, held.mean(), held.var(axis=1).mean()
+    settings = task.settings
+    found = of_spectrum(
+        Moments(*map(jnp.asarray, seen)), settings.frequency, settings.resolution, jnp.zeros(0)
     )
-    moments = Moments(*map(jnp.asarray, seen))
-    return {name: float(value) for name, value in _derived(as_arrays(task), moments).items()}
+    found["corner_frequency"] = slowest_rate(task) / (2 * np.pi)
+    known = (*BASE, "harmonic_frequency")
+    return {name: float(value) for name, value in (found | {n: task[n] for n in known}).items()}
 
 
 def off(task, free):
@@ -1056,9 +1053,9 @@ def test_any_number_of_points_is_one_compiled_program(x64):
     objective = problem.linear()
     theta = np.random.default_rng(0).normal(size=(BATCH + 5, 3))
     seen = expand(objective, theta)
-    traces = len(_of_rows.programs)
+    traces = len(_noise_rows.programs)
     single = expand(objective, theta[-2:])
-    assert len(_of_rows.programs) == traces
+    assert len(_noise_rows.programs) == traces
     np.testing.assert_allclose(seen.moments[0].power[-2:], single.moments[0].power, rtol=1e-12)
     assert seen.slopes[0].power.shape == (BATCH + 5, 30, 3)
 

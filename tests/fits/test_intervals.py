@@ -91,23 +91,28 @@ def rise(objective, seen, theta):
     return np.sqrt(np.maximum(cost[1:] - cost[0], 0.0))
 
 
+def _response(task):
+    time = 0.0 if task.activation is None else task.activation.time
+    return linearise(task), task.muscle.base()[0], time
+
+
 @eqx.filter_jit
 def _levels(task, dampings, log_f):
     def one(c_w, c_z):
         changed = task.replace(c_w=c_w, c_z=c_z)
-        return half_power_level(changed, linearise(changed), log_f)
+        return half_power_level(*_response(changed), log_f)
 
     return jax.vmap(one)(*dampings)
 
 
 @eqx.filter_jit
 def _level(task, log_f):
-    return half_power_level(task, linearise(task), log_f)
+    return half_power_level(*_response(task), log_f)
 
 
 @eqx.filter_jit
 def _frequency(task):
-    return half_power_frequency(task, linearise(task))
+    return half_power_frequency(*_response(task))
 
 
 def level(task, theta, f):

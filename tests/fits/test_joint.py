@@ -18,11 +18,9 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits._joint import planned_jointly
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._arguments import FitOptions, joint_names, task_for
-from jaxmuscle.objective._consequences import expand
-from jaxmuscle.objective._coordinates import task_at
+from jaxmuscle.objective._consequences import expand, quantities
 from jaxmuscle.objective._covariance import common_scales, identifiability
-from jaxmuscle.objective._derived import derived
-from jaxmuscle.objective._residuals import Residuals
+from jaxmuscle.objective._residuals import Residuals, data_residuals
 from jaxmuscle.objective._starts import distinct, starting_points
 
 TRUTH = jm.Isometric().replace(
@@ -285,7 +283,8 @@ def test_the_joint_problem_is_its_parts(x64):
     here = seen.row(0)
     residuals = np.asarray(objective.residuals(jnp.asarray(theta[0]), here.moments, objective.data))
     parts = [
-        p.data_residuals(m, p.data) for p, m in zip(objective.parts, here.moments, strict=True)
+        data_residuals(p.residual, m, p.data)
+        for p, m in zip(objective.parts, here.moments, strict=True)
     ]
     np.testing.assert_allclose(residuals, np.concatenate([*parts, theta[0]]))
 
@@ -419,12 +418,12 @@ def test_a_result_holds_everything(quick):
         objective = planned(
             quick.targets, quick.tasks, ("harmonic_amplitude", "k_w"), free=("c_w",)
         ).problem.linear()
-        seen = expand(objective, np.zeros((1, 1))).row(0)
-        for i, target in enumerate(quick.parts):
-            part = objective.parts[i]
-            values = derived(task_at(part.task, part.coordinates, jnp.zeros(1)), seen.moments[i])
+        tables, _ = quantities(objective, expand(objective, np.zeros((1, 1))))
+        for values, target in zip(tables, quick.parts, strict=True):
             for name in ("corner_frequency", "model_mean", "band_8_12"):
-                assert quick.derived[f"{name}@{target}"].value == pytest.approx(float(values[name]))
+                assert quick.derived[f"{name}@{target}"].value == pytest.approx(
+                    float(values[name][0])
+                )
     assert any(notice.startswith("fitted by the formula alone") for notice in quick.notices)
 
 

@@ -21,10 +21,11 @@ from jaxmuscle.model import Constant, Decay, RampHold
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._problem import Part, target_variation
 from jaxmuscle.response._autocovariance import Autocovariance
-from jaxmuscle.response._expected import _compiled_response, covariance_operator, expected_powers, lags_of
+from jaxmuscle.response._expected import covariance_operator, expected_powers, lags_of
 from jaxmuscle.response._expected_moments import expected_moments, linear_spectrum
 from jaxmuscle.response._harmonic_line import _ordinates, line_table
 from jaxmuscle.response._linearised import check_equilibrium, has_response, linearised
+from jaxmuscle.response._rows import _noise_rows
 from jaxmuscle.response._transfer import system_of, transfer
 from jaxmuscle.spectra._bin_law import bin_rows
 from jaxmuscle.spectra._decimation import FINER
@@ -410,9 +411,9 @@ def test_aliases_are_those_of_the_rate_of_the_recording(x64, amplitude, rate, re
 def test_one_program_serves_recordings_of_all_rates(x64):
     task, settings = jm.PrescribedMotion(F_ext=10), Settings(sampling="filtered")
     jm.expected_spectrum(task, settings)
-    before = _compiled_response.traces
+    before = _noise_rows.traces
     powers = [jm.expected_spectrum(task, settings, recorded_at=r).power for r in (400, 1234.5)]
-    assert _compiled_response.traces == before
+    assert _noise_rows.traces == before
     assert np.max(np.abs(powers[0] / powers[1] - 1)) > 0.01
 
 
@@ -855,9 +856,10 @@ def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples, head):
         states = [step @ state for state in states]
     powers = jnp.stack([np.linalg.matrix_power(step, 2**k) for k in range(11)])
     r = r[:samples]
-    found = Autocovariance(jnp.asarray(first), jnp.asarray(rows), powers, jnp.asarray(start))
+    parts = first[None], rows[None], powers[:, None], start.T[None]
     lagged, variance = at_once(
-        lambda found: (found.lagged(samples), found.mean_variance(samples)), found
+        lambda *found: (found[0].lagged(samples)[0], found[0].mean_variance(samples)[0]),
+        Autocovariance(*map(jnp.asarray, parts)),
     )
     np.testing.assert_allclose(lagged, r, rtol=1e-12, atol=1e-13)
     lag = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))

@@ -83,7 +83,8 @@ class Linear(eqx.Module):
     ) -> tuple[Moments, Moments]:
         """The same with each row of values, and their slopes along a last axis."""
         sampled = Sampled(task.settings, self.window, self.samples, self.recorded)
-        moments, slopes, _ = moments_of_rows(task, own, values, sampled, self.points, along)
+        points = None if self.points is None else np.asarray(self.points)
+        moments, slopes, _ = moments_of_rows(task, own, values, sampled, points, along)
         slopes = self._chosen(
             slopes, lambda x, c: x * np.asarray(c)[..., None], lambda x: x[:, self.chosen]
         )

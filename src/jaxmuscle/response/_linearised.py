@@ -205,6 +205,7 @@ class Mechanics:
         self.defaults = np.array([float(task[name]) for name in self.names])
         self.columns = np.array([self.names.index(name) for name in own], dtype=int)
         self.bare, paths = mechanics(task), paths_of(task)
+        self.held = held_up(self.bare)
         place = [i for i, n in enumerate(self.names) if paths[n][0] not in NOT_MECHANICAL]
         self.place, self.moving = np.array(place, dtype=int), tuple(self.names[i] for i in place)
         self.seen: dict[float, tuple[np.ndarray, Near]] = {}
@@ -243,9 +244,10 @@ class Mechanics:
         known = self.seen.get(time)
         if known is None or not np.array_equal(whole, known[0]):
             moving = whole[:, self.place]
-            task = held_up(self.bare) if time == HOLD else self.bare
+            task = self.held if time == HOLD else self.bare
             program = functools.partial(_operating_points, task, self.moving, as_arrays(time))
-            known = self.seen[time] = whole, Near(*in_parts(program, moving), moving)
+            found, slopes = in_parts(program, moving)
+            known = self.seen[time] = whole, Near(found, slopes, moving)
         return known
 
 

@@ -400,26 +400,27 @@ class _Many(NamedTuple):
     along: tuple[str, ...]
     sampled: Sampled
 
-    def made(self, values: np.ndarray) -> tuple[Any, ...]:
-        """What is known of some rows, and what the large programs take of them."""
+    def seen(self, values: np.ndarray) -> "_Seen":
+        """At some rows."""
         here = Mechanics.of(self.task, self.own)
         columns = np.array([here.names.index(name) for name in self.along], dtype=int)
         whole, near = here.at(values)
         program = functools.partial(_made, here.bearer, here.names, here.place)
         made, by = in_parts(program, whole, near)
-        return here, whole, near, columns, made, jax.tree.map(lambda x: x[..., columns], by)
+        return _Seen(here, whole, near, columns, made, jax.tree.map(lambda x: x[..., columns], by))
 
     def moments(
         self, values: np.ndarray, points: np.ndarray | None
     ) -> tuple[Moments, Moments, Linearisation]:
         """Of some rows."""
-        here, whole, near, columns, made, by = self.made(values)
+        seen = self.seen(values)
+        here, near = seen.here, seen.near
 
         def widened(slope: Any) -> np.ndarray:
             return _widened(slope, here.moving, self.along)
 
-        power, variance, by_power, by_variance, resonant, by_resonant = self._noise(made, by)
-        line, swing, by_line, by_swing = self._line(here, whole, near, columns, made.line, by.line)
+        power, variance, by_power, by_variance, resonant, by_resonant = self.noise(seen)
+        line, swing, by_line, by_swing = self.line(seen)
         stiffness = by_stiffness = ()
         if points is not None:
             f = as_arrays(np.resize(points, -(-len(points) // 64) * 64))
@@ -442,7 +443,10 @@ class _Many(NamedTuple):
             system,
         )
 
-    def _noise(self, made: _Made, by: _Made) -> tuple[Any, ...]:
+    def noise(self, seen: "_Seen") -> tuple[Any, ...]:
+        """Power and variance of all noise, their slopes, and power of every resonance with its
+        slopes."""
+        made, by = seen.made, seen.by
         settings, parts = self.sampled.settings, made.parts.matrix.shape[1]
         long = settings.length > LONG
         rows = _Rows.of(by.parts, parts)
@@ -472,12 +476,12 @@ class _Many(NamedTuple):
         sums = (np.sum(x, axis=1) for x in (power, variance, by_power, by_variance))
         return (*sums, resonant, by_resonant)
 
-    def _line(
-        self, here: Mechanics, whole: Any, near: Near, columns: np.ndarray, line: Any, by: Any
-    ) -> tuple[np.ndarray, ...]:
-        if line is None:
-            return self._enveloped(here, columns, whole, near)
-        settings, frequency = self.sampled.settings, line.frequency
+    def line(self, seen: "_Seen") -> tuple[np.ndarray, ...]:
+        """Power and variance of the harmonic, and their slopes."""
+        line, by = seen.made.line, seen.by.line
+        if line is None or by is None:
+            return self._enveloped(seen)
+        settings, frequency = self.sampled.settings, np.asarray(line.frequency)
         different, back = np.unique(frequency, return_inverse=True)
         segments = (
             (settings, self.sampled.window)
@@ -509,46 +513,55 @@ class _Many(NamedTuple):
         by_power = rows.spread(along[..., :bins], 1, columns)[:, 0]
         return power[:, 0, :bins], swing[:, 0], by_power, rows.spread(rise, 1, columns)[:, 0]
 
-    def _enveloped(
-        self, here: Mechanics, columns: np.ndarray, whole: np.ndarray, near: Near
-    ) -> tuple[np.ndarray, ...]:
-        sampled = self.sampled.settings, self.sampled.window
-        program = functools.partial(_enveloped, here.bearer, here.names, here.place, sampled)
-        (line, swing), (by_line, by_swing) = in_parts(program, whole, near)
-        return line, swing, by_line[..., columns], by_swing[..., columns]
+    def _enveloped(self, seen: "_Seen") -> tuple[np.ndarray, ...]:
+        here, sampled = seen.here, (self.sampled.settings, self.sampled.window)
+        program: Any = functools.partial(_enveloped, here.bearer, here.names, here.place, sampled)
+        (line, swing), (by_line, by_swing) = in_parts(program, seen.whole, seen.near)
+        return line, swing, by_line[..., seen.columns], by_swing[..., seen.columns]
+
+
+class _Seen(NamedTuple):
+    """What is known of some rows: values of all names, operating points, where the asked columns
+    are, and what the large programs take, with its slopes."""
+
+    here: Mechanics
+    whole: np.ndarray
+    near: Near
+    columns: np.ndarray
+    made: _Made
+    by: _Made
 
 
 def noise_parts(task: AbstractTask) -> tuple[Chain, Int[np.ndarray, " parts"]]:
     """The parts of a task's noise along a leading axis, and which component each belongs to."""
-    made = _Many(task, (), (), Sampled(task.settings, WINDOW, 0, 0.0)).made(np.zeros((1, 0)))[4]
+    many = _Many(task, (), (), Sampled(task.settings, WINDOW, 0, 0.0))
+    made = many.seen(np.zeros((1, 0))).made
     return jax.tree.map(lambda x: x[0], made.parts), _component_of_parts(task)
 
 
-def variation_sd_of_numbers(task: AbstractTask, sampled: Sampled, lags: int) -> float:
+def variation_sd_of_numbers(task: AbstractTask, sampled: Sampled, lags: int) -> Array:
     """`log_variation_sd` of a task's output, good for that many lags."""
     sampled = sampled._replace(samples=as_arrays(sampled.samples, int))
-    many = _Many(task, (), (), sampled)
-    *known, made, by = many.made(np.zeros((1, 0)))
-    swing = many._line(*known, made.line, by.line)[1][0]
-    parts = made.parts.matrix.shape[1]
-    padded = -(-parts // 4) * 4
-    rows = jax.tree.map(lambda x: x[0, np.minimum(np.arange(padded), parts - 1)], made.parts)
-    settings = sampled.settings
-    found = _variation_sd(
-        rows,
-        as_arrays((np.arange(padded) < parts, low_pass_spread(settings), 1 / settings.rate)),
-        as_arrays((swing, task.harmonic.frequency / settings.rate)),
-        sampled.samples,
-        settings.sampling,
-        lags,
-    )
-    return float(found)
+    many, settings = _Many(task, (), (), sampled), sampled.settings
+    seen = many.seen(np.zeros((1, 0)))
+    swing = many.line(seen)[1][0]
+    parts = seen.made.parts.matrix.shape[1]
+    every = np.arange(-(-parts // 4) * 4)  # a program for 4, 8 ...
+    rows = jax.tree.map(lambda x: x[0, np.minimum(every, parts - 1)], seen.made.parts)
+    given = every < parts, low_pass_spread(settings), 1 / settings.rate
+    line = swing, task.harmonic.frequency / settings.rate
+    sampling = settings.sampling, lags
+    given, line = as_arrays((given, line))
+    return _variation_sd(rows, given, line, sampled.samples, sampling)
 
 
 @kept
-def _variation_sd(parts, settings, line, samples, sampling, lags):
-    counts, spread, interval = settings
-    each = autocovariance(parts, interval, lags, sampling, 0.0)
+def _variation_sd(
+    parts: Chain, given: Any, line: Any, samples: Any, sampling: tuple[str, int]
+) -> Array:
+    """`log_variation_sd` of those parts that count, 1 or 0 for each."""
+    (counts, spread, interval), (kind, lags) = given, sampling
+    each = autocovariance(parts, interval, lags, kind, 0.0)
     r, slow = counts @ each.lagged(lags), counts @ each.mean_variance(samples)
     return log_variation_sd(r, spread, slow, *line, samples)
 

@@ -17,7 +17,7 @@ from jaxmuscle._common.text import listed
 from jaxmuscle._common.types import Key, Seed
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._task import AbstractTask, require_task
-from jaxmuscle.response._equilibrium import fastest_rate
+from jaxmuscle.response._equilibrium import fastest_rate, without_settings
 from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_inputs, linearised
 from jaxmuscle.spectra._settings import WINDOW, Sampling, SpectrumSettings
 
