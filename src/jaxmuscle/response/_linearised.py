@@ -37,7 +37,7 @@ class Linearisation(NamedTuple):
     E: Float[Array, "5"]
 
 
-def linearise(task: AbstractTask, time: float = HOLD) -> Linearisation:
+def linearise(task: AbstractTask, time: Scalar | float = HOLD) -> Linearisation:
     """Jacobians of the task's own vector field and output at its equilibrium under the inputs at
     `time` [s].
 
@@ -194,9 +194,8 @@ class Bearer(Muscle):
 class Mechanics:
     """One task to be linearised with many values of its `own` parameters.
 
-    `bare`: what its mechanics depend on, with the names of the `moving` values; `bearer`: what its
-    noise and its line depend on besides the operating point; `names`: all that programs have slopes
-    for, of which the moving ones are at `place`.
+    `bare`: what its mechanics depend on, with the names of the `moving` values; `names`: all that
+    programs have slopes for, of which the moving ones are at `place`.
     """
 
     def __init__(self, task: AbstractTask, own: tuple[str, ...]):
@@ -209,6 +208,7 @@ class Mechanics:
         place = [i for i, n in enumerate(self.names) if paths[n][0] not in NOT_MECHANICAL]
         self.place, self.moving = np.array(place, dtype=int), tuple(self.names[i] for i in place)
         self.seen: dict[float, tuple[np.ndarray, Near]] = {}
+        self._bearers: dict[tuple[Any, ...], Any] = {}
 
     @classmethod
     def of(cls, task: AbstractTask, own: Sequence[str] = ()) -> "Mechanics":
@@ -224,15 +224,41 @@ class Mechanics:
         _LATEST[:] = [found, *_LATEST[: LATEST - 1]]
         return found
 
-    @functools.cached_property
-    def bearer(self) -> LinearTask:
-        """With the linearisation of the task itself."""
-        common: Any = self.task.with_parts(settings=self.bare.settings).common
-        found = self.at(np.zeros((1, len(self.own))) + self.defaults[self.columns])[1].point
-        point = jax.tree.map(lambda x: x[0], found)
-        return as_arrays(
-            LinearTask(point.system, **(common | {"muscle": Bearer(coefficients=point.base)}))
-        )
+    @property
+    def components(self) -> list[tuple[Any, ...]]:
+        """Where each component of the noise is in it."""
+        noise = self.task.noise
+        if noise.components == (noise,):
+            return [()]
+        return [("parts", i) for i in range(len(noise.components))]
+
+    def bearer(self, about: tuple[Any, ...]) -> tuple[LinearTask, tuple[str, ...], np.ndarray]:
+        """A task that has nothing but the activation and one component of the noise, or the
+        harmonic, `about` which it is; what its values are called, and their columns: the mechanical
+        ones first."""
+        if about not in self._bearers:
+            point = jax.tree.map(lambda x: x[0], next(iter(self.seen.values()))[1].point)
+            common: Any = self.bare.common | {"muscle": Bearer(coefficients=point.base)}
+            common["activation"] = self.task.activation
+            if about[0] == "harmonic":
+                common["harmonic"] = self.task.harmonic
+            else:
+                common["noise"] = functools.reduce(
+                    lambda x, step: x[step] if isinstance(step, int) else getattr(x, step),
+                    about[1:],
+                    self.task.noise,
+                )
+            found = as_arrays(LinearTask(point.system, **common))
+            own = {path: name for name, path in paths_of(found).items()}
+            rows = [("", i) for i in self.place]  # by the operating point, not by name
+            for i, name in enumerate(self.names):
+                path = paths_of(self.task)[name]
+                if path[0] == "activation" or path[: len(about)] == about:
+                    kind = path if path[0] == "activation" else (about[0], *path[len(about) :])
+                    rows.append((own[kind], i))
+            names, columns = zip(*[(name, i) for name, i in rows], strict=True)
+            self._bearers[about] = found, names, np.array(columns, dtype=int)
+        return self._bearers[about]
 
     def at(
         self, values: Float[np.ndarray, "rows own"], time: float = HOLD

@@ -18,7 +18,6 @@ from jaxtyping import Array, Float, Int
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
-from jaxmuscle.model._activation import ACTIVE
 from jaxmuscle.model._parameters import set_parameters
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._signals import Constant
@@ -97,13 +96,6 @@ def moments_of_rows(
     return jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 
-class _Made(NamedTuple):
-    """What the moments of a task are computed from: its noise, part by part, and its line."""
-
-    parts: Chain
-    line: "_Line | None"
-
-
 class _Line(NamedTuple):
     """A steady harmonic: what responds to it, its size (real and imaginary part), its frequency."""
 
@@ -124,35 +116,51 @@ def _with_values(
 
 
 @kept
-def _made(
+def _parts_of(
     task: LinearTask,
     names: tuple[str, ...],
     place: Int[Array | np.ndarray, " moving"],
     values: Float[Array | np.ndarray, "points names"],
     near: Near,
-) -> tuple[_Made, _Made]:
-    """What the large programs take, of a task with each row of values, and its slopes. `place`:
-    where the mechanical values are."""
+) -> tuple[Chain, Chain]:
+    """The parts of a noise that is alone in its task, with each row of values, and their slopes.
+    `place`: where the mechanical values are."""
     size = len(task.system.A) + FURTHER
 
     def one(values, near):
-        def made(values):
+        def parts(values):
+            point = near.at(values[place])
+            (whole,) = chains(_with_values(task, names, values, point), point.balanced)
+            return stacked([few for part in whole for few in part.split(CHANNELS)], size, CHANNELS)
+
+        return value_and_slopes(parts, values)
+
+    return jax.vmap(one)(values, near)
+
+
+@kept
+def _line_of(
+    task: LinearTask,
+    names: tuple[str, ...],
+    place: Int[Array | np.ndarray, " moving"],
+    values: Float[Array | np.ndarray, "points names"],
+    near: Near,
+) -> tuple[_Line, _Line]:
+    """The line of a task with each row of values, and its slopes."""
+    size = len(task.system.A) + 2
+
+    def one(values, near):
+        def line(values):
             point = near.at(values[place])
             there, system = _with_values(task, names, values, point), point.balanced
-            parts = [
-                few for own in chains(there, system) for part in own for few in part.split(CHANNELS)
-            ]
-            line = None
-            if isinstance(task.harmonic.envelope, Constant):
-                reply = harmonic_size(there, system.A.dtype)
-                line = _Line(
-                    _filled(harmonic_system(there, system), len(task.system.A) + 2),
-                    jnp.stack([jnp.real(reply), jnp.imag(reply)]),
-                    jnp.asarray(there.harmonic.frequency, system.A.dtype),
-                )
-            return _Made(stacked(parts, size, CHANNELS), line)
+            reply = harmonic_size(there, system.A.dtype)
+            return _Line(
+                _filled(harmonic_system(there, system), size),
+                jnp.stack([jnp.real(reply), jnp.imag(reply)]),
+                jnp.asarray(there.harmonic.frequency, system.A.dtype),
+            )
 
-        return value_and_slopes(made, values)
+        return value_and_slopes(line, values)
 
     return jax.vmap(one)(values, near)
 
@@ -403,11 +411,29 @@ class _Many(NamedTuple):
     def seen(self, values: np.ndarray) -> "_Seen":
         """At some rows."""
         here = Mechanics.of(self.task, self.own)
-        columns = np.array([here.names.index(name) for name in self.along], dtype=int)
         whole, near = here.at(values)
-        program = functools.partial(_made, here.bearer, here.names, here.place)
-        made, by = in_parts(program, whole, near)
-        return _Seen(here, whole, near, columns, made, jax.tree.map(lambda x: x[..., columns], by))
+        columns = np.array([here.names.index(name) for name in self.along], dtype=int)
+        each = [
+            self._run(_parts_of, here, ("noise", *place), whole, near) for place in here.components
+        ]
+        parts, slopes = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *each)
+        line = by_line = None
+        if isinstance(self.task.harmonic.envelope, Constant):
+            line, by_line = self._run(_line_of, here, ("harmonic",), whole, near)
+        component = np.repeat(np.arange(len(each)), [own.matrix.shape[1] for own, _ in each])
+        return _Seen(here, whole, near, columns, component, parts, slopes, line, by_line)
+
+    def _run(
+        self, program: Any, here: Mechanics, about: tuple, whole: np.ndarray, near: Near
+    ) -> tuple[Any, Any]:
+        """A program about one component, and its slopes along one's own."""
+        task, names, columns = here.bearer(about)
+        place = np.arange(len(here.place))
+        found, slopes = in_parts(
+            functools.partial(program, task, names, place), whole[:, columns], near
+        )
+        asked = [here.names[i] for i in columns]
+        return found, _widened(slopes, asked, self.along)
 
     def moments(
         self, values: np.ndarray, points: np.ndarray | None
@@ -446,10 +472,9 @@ class _Many(NamedTuple):
     def noise(self, seen: "_Seen") -> tuple[Any, ...]:
         """Power and variance of all noise, their slopes, and power of every resonance with its
         slopes."""
-        made, by = seen.made, seen.by
-        settings, parts = self.sampled.settings, made.parts.matrix.shape[1]
+        settings, parts = self.sampled.settings, len(seen.component)
         long = settings.length > LONG
-        rows = _Rows.of(by.parts, parts)
+        rows = _Rows.of(seen.by_parts, parts)
         program = functools.partial(
             _noise_rows,
             operator=settings if long else as_arrays(_padded_operator(settings)),
@@ -458,16 +483,15 @@ class _Many(NamedTuple):
             samples=self.sampled.samples,
             recorded=self.sampled.recorded,
         )
-        (power, variance), (along, rise) = rows.run(program, made.parts, by.parts)
+        (power, variance), (along, rise) = rows.run(program, seen.parts, seen.by_parts)
         bins, columns, first = len(settings.frequency), len(self.along), rows.first()
         power, variance = power[:, first, :bins], variance[:, first]
         by_power = rows.spread(along[..., :bins], parts, columns)
         by_variance = rows.spread(rise, parts, columns)
-        component, components = _component_of_parts(self.task), self.task.noise.components
-        assert len(component) == parts
+        components = self.task.noise.components
         resonant, by_resonant = (
             tuple(
-                np.sum(x[:, component == i], axis=1)
+                np.sum(x[:, seen.component == i], axis=1)
                 for i, each in enumerate(components)
                 if isinstance(each, ResonantNoise)
             )
@@ -478,7 +502,7 @@ class _Many(NamedTuple):
 
     def line(self, seen: "_Seen") -> tuple[np.ndarray, ...]:
         """Power and variance of the harmonic, and their slopes."""
-        line, by = seen.made.line, seen.by.line
+        line, by = seen.line, seen.by_line
         if line is None or by is None:
             return self._enveloped(seen)
         settings, frequency = self.sampled.settings, np.asarray(line.frequency)
@@ -514,29 +538,36 @@ class _Many(NamedTuple):
         return power[:, 0, :bins], swing[:, 0], by_power, rows.spread(rise, 1, columns)[:, 0]
 
     def _enveloped(self, seen: "_Seen") -> tuple[np.ndarray, ...]:
-        here, sampled = seen.here, (self.sampled.settings, self.sampled.window)
-        program: Any = functools.partial(_enveloped, here.bearer, here.names, here.place, sampled)
-        (line, swing), (by_line, by_swing) = in_parts(program, seen.whole, seen.near)
-        return line, swing, by_line[..., seen.columns], by_swing[..., seen.columns]
+        sampled = self.sampled.settings, self.sampled.window
+
+        def program(task: Any, names: Any, place: Any, values: Any, near: Near) -> Any:
+            return _enveloped(task, names, place, sampled, values, near)
+
+        found = self._run(program, seen.here, ("harmonic",), seen.whole, seen.near)
+        (line, swing), (by_line, by_swing) = found
+        return line, swing, by_line, by_swing
 
 
 class _Seen(NamedTuple):
     """What is known of some rows: values of all names, operating points, where the asked columns
-    are, and what the large programs take, with its slopes."""
+    are; the parts of the noise, which component each belongs to, and the line, with slopes."""
 
     here: Mechanics
     whole: np.ndarray
     near: Near
     columns: np.ndarray
-    made: _Made
-    by: _Made
+    component: Int[np.ndarray, " parts"]
+    parts: Chain
+    by_parts: Chain
+    line: _Line | None
+    by_line: _Line | None
 
 
 def noise_parts(task: AbstractTask) -> tuple[Chain, Int[np.ndarray, " parts"]]:
     """The parts of a task's noise along a leading axis, and which component each belongs to."""
     many = _Many(task, (), (), Sampled(task.settings, WINDOW, 0, 0.0))
-    made = many.seen(np.zeros((1, 0))).made
-    return jax.tree.map(lambda x: x[0], made.parts), _component_of_parts(task)
+    seen = many.seen(np.zeros((1, 0)))
+    return jax.tree.map(lambda x: x[0], seen.parts), seen.component
 
 
 def variation_sd_of_numbers(task: AbstractTask, sampled: Sampled, lags: int) -> Array:
@@ -545,9 +576,9 @@ def variation_sd_of_numbers(task: AbstractTask, sampled: Sampled, lags: int) -> 
     many, settings = _Many(task, (), (), sampled), sampled.settings
     seen = many.seen(np.zeros((1, 0)))
     swing = many.line(seen)[1][0]
-    parts = seen.made.parts.matrix.shape[1]
+    parts = len(seen.component)
     every = np.arange(-(-parts // 4) * 4)  # a program for 4, 8 ...
-    rows = jax.tree.map(lambda x: x[0, np.minimum(every, parts - 1)], seen.made.parts)
+    rows = jax.tree.map(lambda x: x[0, np.minimum(every, parts - 1)], seen.parts)
     given = every < parts, low_pass_spread(settings), 1 / settings.rate
     line = swing, task.harmonic.frequency / settings.rate
     sampling = settings.sampling, lags
@@ -564,16 +595,6 @@ def _variation_sd(
     each = autocovariance(parts, interval, lags, kind, 0.0)
     r, slow = counts @ each.lagged(lags), counts @ each.mean_variance(samples)
     return log_variation_sd(r, spread, slow, *line, samples)
-
-
-def _component_of_parts(task: AbstractTask) -> np.ndarray:
-    """Which component of the noise each of the parts of `chains` belongs to."""
-    found = []
-    for i, noise in enumerate(task.noise.components):
-        passes = [task.activation is not None and j in ACTIVE for j in noise.acts_on]
-        counts = [1] if noise.shared else [passes.count(own) for own in set(passes)]
-        found += [i] * sum(-(-count // CHANNELS) for count in counts)
-    return np.array(found)
 
 
 @functools.cache
