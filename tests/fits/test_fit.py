@@ -342,8 +342,15 @@ class Direct(eqx.Module):
     def spread(self, slope, i):
         return slope
 
+    def filled(self):
+        return self
+
+    def moments(self, theta):
+        none = jnp.zeros(())
+        return Moments(self.values(theta), none, none, none)
+
     def residuals(self, theta, moments, data):
-        return moments[0]
+        return moments[0].power
 
 
 class Curved(Direct):
@@ -352,7 +359,7 @@ class Curved(Direct):
 
     scale: float = 10.0
 
-    def moments(self, theta):
+    def values(self, theta):
         valley = jnp.stack(
             [self.scale * (theta[1] - theta[0] ** 2), 1 - theta[0], 0.5 * jnp.ones_like(theta[0])]
         )
@@ -383,7 +390,7 @@ def test_a_step_to_where_the_model_explodes_is_rejected(x64):
     class Cliff(Direct):
         """log(s): from s = 5 a Gauss-Newton step leads to s < 0."""
 
-        def moments(self, theta):
+        def values(self, theta):
             return jnp.log(theta)
 
     reports = []
@@ -406,7 +413,7 @@ def test_descent_takes_the_problem_that_prepare_gives(x64):
     class Line(Direct):
         at: float = 0.0
 
-        def moments(self, theta):
+        def values(self, theta):
             return theta - self.at
 
     found = least_squares(Line(at=1.0), np.zeros((1, 1)), 20, prepare=lambda p, s: Line(at=2.0))

@@ -281,13 +281,20 @@ _LATEST: list[Mechanics] = []
 
 
 def held_up(task: AbstractTask) -> AbstractTask:
-    """The task with steps that are over at `HOLD` as constants: a program serves both."""
-    levels = {
+    """The task with steps that are over at `HOLD` as constants, and with the state from which its
+    equilibrium is looked for: a program serves tasks with and without these."""
+    parts: dict[str, Any] = {
         name: Constant(signal.level)
         for name, signal in _signals(task).items()
         if type(signal) is SmoothStep and float(signal.start + signal.rise) <= HOLD
     }
-    return task.with_parts(**levels) if levels else task
+    place = getattr(task, "x_z", 0.0)
+    place = place.level if isinstance(place, Constant) else place
+    if task.initial is None and not isinstance(place, AbstractSignal):
+        start = np.array(task.initial_state())
+        start[:1] += place
+        parts["initial"] = tuple(as_arrays(x) for x in start)
+    return task.with_parts(**parts) if parts else task
 
 
 def in_parts(program: Callable[..., Any], *rows: Any) -> Any:
