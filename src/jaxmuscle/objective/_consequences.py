@@ -284,9 +284,7 @@ def expand(
     return Expansion(theta, tuple(moments for moments, _ in each), along)
 
 
-def _expanded(
-    part: PartResiduals, theta: Float[np.ndarray, "points own"], slopes: bool
-) -> tuple[Any, Any]:
+def _expanded(part: Any, theta: Float[np.ndarray, "points own"], slopes: bool) -> tuple[Any, Any]:
     """Moments of one part and their slopes: a linear response by the programs that all share, a
     Monte Carlo simulation for all points together."""
     if not isinstance(part.model, Linear):

@@ -144,7 +144,7 @@ class Coordinates(eqx.Module):
         i = self.names.index(name)
         return np.asarray(np.log(values / self.centre[i]) / self.sd[i])
 
-    def slope(self, values: Float[np.ndarray, " free"]) -> Float[np.ndarray, " free"]:
+    def slope(self, values: Float[np.ndarray, "*rows free"]) -> Float[np.ndarray, "*rows free"]:
         """dv/dθ at natural values."""
         return np.where(self.positive, values, 1.0) * self.sd
 

@@ -46,6 +46,13 @@ class Data(eqx.Module):
         return (self.variation is not None) + (self.mean is not None) + points
 
 
+class Compared(eqx.Module):
+    """What the residuals of one target follow from once its moments are known."""
+
+    data: Data
+    residual: str = eqx.field(static=True)
+
+
 class PartResiduals(eqx.Module):
     """One target's share: its task and coordinates, the model of its moments, and its data."""
 
@@ -108,7 +115,7 @@ class Residuals(eqx.Module):
     steps that lower them (None: Levenberg-Marquardt).
     """
 
-    parts: tuple[PartResiduals, ...]
+    parts: tuple[Any, ...]  # of `PartResiduals`; where they are `filled`, of `Compared`
     coordinates: Coordinates
     prior_root: Float[Array | np.ndarray, "free free"]
     moving: Float[Array | np.ndarray, " free"]
@@ -155,10 +162,7 @@ class Residuals(eqx.Module):
         """What residuals follow from once moments are known, with coordinates that nothing depends
         on: a program of steps that fits share, whatever their tasks and free parameters."""
         more = free_size(len(self.coordinates.names)) - len(self.coordinates.names)
-        parts = tuple(
-            PartResiduals(None, None, None, p.data, None, p.residual)  # pyright: ignore
-            for p in self.parts
-        )
+        parts = tuple(Compared(part.data, part.residual) for part in self.parts)
         root = np.eye(len(self.prior_root) + more, dtype=self.prior_root.dtype)
         root[: len(self.prior_root), : len(self.prior_root)] = self.prior_root
         return Residuals(

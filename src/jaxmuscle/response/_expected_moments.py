@@ -1,11 +1,14 @@
 """The expected moments of tasks, by programs that tasks of every make share."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmuscle._common.arrays import all_concrete, as_arrays
+from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings, samples_in
@@ -21,6 +24,9 @@ from ._rows import Sampled, moments_of_rows, variation_sd_of_numbers
 LAGS = 4096
 
 
+_response = kept(response)  # compiled apart, so that it is traced once
+
+
 def expected_moments(
     task: AbstractTask,
     settings: SpectrumSettings,
@@ -31,10 +37,11 @@ def expected_moments(
     """`response`; outside a transformation by the programs of `moments_of_rows`."""
     samples = samples_in(window, settings) if samples is None else samples
     if not all_concrete((task, samples, recorded)):
-        return response(task, settings, window, samples, recorded)
+        return _response(as_arrays(task), settings, window, samples, as_arrays(recorded))
     sampled = Sampled(settings, window, samples, recorded)
     moments, _, system = moments_of_rows(task, (), np.zeros((1, 0)), sampled)
-    return jax.tree.map(lambda x: jnp.asarray(x[0]), (moments, system))
+    with jax.debug_nans(False):  # a sign here: no equilibrium
+        return jax.tree.map(lambda x: jnp.asarray(x[0]), (moments, system))
 
 
 def variation_sd(
@@ -44,17 +51,22 @@ def variation_sd(
     most = LAGS
     while most < samples:
         most *= 4
-    spread = low_pass_spread(settings)
-    lags = most + len(spread) // 2
+    lags = most + len(low_pass_spread(settings)) // 2
     if all_concrete(task):
         return variation_sd_of_numbers(task, Sampled(settings, WINDOW, samples, 0.0), lags)
-    task = as_arrays(task)
+    return _variation_sd(as_arrays(task), settings, samples, lags)
+
+
+@kept
+def _variation_sd(
+    task: AbstractTask, settings: SpectrumSettings, samples: Any, lags: int
+) -> Float[Array, ""]:
     system = linearise(task)
     each, _ = autocovariances(task, system, settings, lags)
     _, swing = harmonic_line(task, system, settings, WINDOW, samples)
     return log_variation_sd(
         jnp.sum(each.lagged(lags), axis=0),
-        jnp.asarray(spread, system.A.dtype),
+        jnp.asarray(low_pass_spread(settings), system.A.dtype),
         jnp.sum(each.mean_variance(samples)),
         swing,
         task.harmonic.frequency / settings.rate,

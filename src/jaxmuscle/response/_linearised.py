@@ -290,10 +290,10 @@ def held_up(task: AbstractTask) -> AbstractTask:
     }
     place = getattr(task, "x_z", 0.0)
     place = place.level if isinstance(place, Constant) else place
-    if task.initial is None and not isinstance(place, AbstractSignal):
-        start = np.array(task.initial_state())
-        start[:1] += place
-        parts["initial"] = tuple(as_arrays(x) for x in start)
+    size = len(task.state_names)
+    usual = task.initial is None and type(task).initial_state is AbstractTask.initial_state
+    if usual and size and not isinstance(place, AbstractSignal):
+        parts["initial"] = as_arrays((place, *[0.0] * (size - 1)))
     return task.with_parts(**parts) if parts else task
 
 
