@@ -130,7 +130,7 @@ def test_measured(name):
     np.testing.assert_array_equal(target.bins, np.arange(1, 31))
     assert target.proportional_power.sum() == pytest.approx(1, abs=1e-12)
     assert (target.provenance, target.quantity, target.sigma) == ("measured", "force", None)
-    # The programs of a fit depend on the settings: those of a recording of one's own are then there.
+    # So a fit of one leaves the programs that a fit of a recording of your own asks for.
     recorded = Recording(np.arange(1.0, 20001.0) % 97, 2048.0).target()
     assert (target.settings, target.recorded_at) == (recorded.settings, recorded.recorded_at)
     assert target.notices == ()
