@@ -149,7 +149,7 @@ def test_the_log_density_has_second_derivatives():
 
 
 def test_far_away_the_density_is_zero_and_not_a_number_for_a_sampler_to_choke_on(problem):
-    far = np.full(len(problem.names), 15.0)
+    far = np.full(len(problem.names), 20.0)
     assert float(problem.log_density(far)) == -np.inf
     assert np.isfinite(float(problem.log_density(problem.start)))
 
