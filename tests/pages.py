@@ -25,10 +25,13 @@ def name_of(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
 
 
-def blocks(page: Path) -> list[str]:
-    """Its Python blocks in order, also those inside a list."""
+def blocks(page: Path, language: str = "python") -> list[str]:
+    """Its Python blocks in order, also those inside a list; those of the language `py` need what
+    the tests do not install."""
     found = re.findall(
-        r"^( *)```python\n(.*?)^\1```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+        rf"^( *)```{language}\n(.*?)^\1```",
+        page.read_text(encoding="utf-8"),
+        re.MULTILINE | re.DOTALL,
     )
     return [textwrap.dedent(code) for _, code in found]
 

@@ -8,6 +8,7 @@ from . import ensembles as ensembles
 from . import explorer as explorer
 from . import fits as fits
 from . import model as model
+from . import objective as objective
 from . import plot as plot
 from . import response as response
 from . import simulation as simulation
@@ -54,6 +55,7 @@ from .model._white_noise import BandLimitedNoise as BandLimitedNoise
 from .model._white_noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
 from .model._white_noise import WhiteNoise as WhiteNoise
 from .objective._arguments import task_for as task_for
+from .objective._free import free as free
 from .objective._likelihood import log_likelihood as log_likelihood
 from .paper._reproduce import reproduce as reproduce
 from .response._characteristics import static_characteristics as static_characteristics

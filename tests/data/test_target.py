@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from jaxmuscle._common import bundled as _bundled
 from jaxmuscle._common.bundled import describe_targets, list_targets
 from jaxmuscle._common.errors import TargetError
-from jaxmuscle.data import is_recording
+from jaxmuscle.data import Recording, is_recording
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -130,7 +130,9 @@ def test_measured(name):
     np.testing.assert_array_equal(target.bins, np.arange(1, 31))
     assert target.proportional_power.sum() == pytest.approx(1, abs=1e-12)
     assert (target.provenance, target.quantity, target.sigma) == ("measured", "force", None)
-    assert target.settings == SpectrumSettings(filter_direction="both")
+    # So a fit of one leaves the programs that a fit of a recording of your own asks for.
+    recorded = Recording(np.arange(1.0, 20001.0) % 97, 2048.0).target()
+    assert (target.settings, target.recorded_at) == (recorded.settings, recorded.recorded_at)
     assert target.notices == ()
 
 

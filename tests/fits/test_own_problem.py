@@ -1,5 +1,6 @@
 """A fit as functions for optimisers and samplers of one's own, and a fit with another optimiser."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -149,7 +150,7 @@ def test_the_log_density_has_second_derivatives():
 
 
 def test_far_away_the_density_is_zero_and_not_a_number_for_a_sampler_to_choke_on(problem):
-    far = np.full(len(problem.names), 15.0)
+    far = np.full(len(problem.names), 20.0)
     assert float(problem.log_density(far)) == -np.inf
     assert np.isfinite(float(problem.log_density(problem.start)))
 
@@ -243,3 +244,33 @@ def test_results_summarise_themselves(result):
     shown = (result.found | result.parameters).keys() - {"model_mean"}
     assert html.count("<tr>") == 1 + len(result.measured) + len(shown)
     assert html.count(">measured<") == len(result.measured) and ">determined<" in html
+
+
+class Network(jm.AbstractMuscle):
+    """A linear muscle whose stiffness a small network changes."""
+
+    stiffness: float = 300.0
+    m_w: float = 0.5
+    m_z: float = 0.5
+    net: eqx.nn.MLP = eqx.field(
+        default_factory=lambda: eqx.nn.MLP(
+            "scalar", "scalar", 3, 1, activation=jnp.tanh, key=jax.random.key(0)
+        )
+    )
+
+    def base(self):
+        return jnp.stack([jnp.asarray(v) for v in (self.stiffness, 200.0, 40.0, 5.0)])
+
+    def active_force(self, x_w, v_w, u):
+        return (self.stiffness + self.net(100 * x_w) + u[0]) * x_w + (40.0 + u[2]) * v_w
+
+    def passive_force(self, x_w, v_w, x_z, v_z, u):
+        return (200.0 + u[1]) * (x_z - x_w) + (5.0 + u[3]) * (v_z - v_w)
+
+
+def test_a_fit_leaves_the_arrays_of_a_network_and_says_so():
+    task = jm.Isometric(muscle=Network()).with_parts(settings=TARGET.settings)
+    found = jm.fit(task, TARGET, free=("stiffness", "noise_K_w"), **ALONE | {"starts": 2})
+    assert found["stiffness"].value != 300.0
+    assert sum("Network.net holds 10 numbers in arrays" in notice for notice in found.notices) == 1
+    assert eqx.tree_equal(found.task.muscle.net, task.muscle.net, rtol=1e-6)

@@ -73,18 +73,73 @@ def test_slopes_by_name_against_differences_and_against_replace(x64):
         np.testing.assert_allclose(slopes[name], (ahead - behind) / (2 * h), rtol=SLOPE)
 
 
-def test_what_filter_grad_says_of_numbers_and_of_arrays(x64):
-    """The reason for `partition`: None for a Python number, and the slope where all numbers have
-    become arrays."""
-    assert eqx.filter_grad(loss)(TASK).muscle.stiffness_w.k is None
+class Own(jm.AbstractMuscle):
+    """A muscle as a user writes one: plain numbers, one in a part that is a plain module, and a
+    network, which holds functions."""
 
+    class Law(eqx.Module):
+        k: float
+
+    m_w: float = 1
+    m_z: float = 0.5
+    law: Law = eqx.field(default_factory=lambda: Own.Law(200))
+    net: eqx.nn.MLP = eqx.field(
+        default_factory=lambda: eqx.nn.MLP("scalar", "scalar", 3, 1, key=jax.random.key(0))
+    )
+    order: int = eqx.field(static=True, default=2)
+
+    def base(self):
+        return jnp.stack([jnp.asarray(self.law.k)] * 2 + [jnp.asarray(10.0)] * 2)
+
+    def active_force(self, x_w, v_w, u):
+        return (self.law.k + self.net(x_w) + u[0]) * x_w + (10.0 + u[2]) * v_w
+
+    def passive_force(self, x_w, v_w, x_z, v_z, u):
+        return (200.0 + u[1]) * (x_z - x_w) + (10.0 + u[3]) * (v_z - v_w)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        jm.Isometric(5, k_w=400000, noise=jm.PinkNoise({"K_w": 1})),
+        jm.PrescribedForce(activation=jm.Activation(1), initial=(0, 0, 0, 0)),
+        jm.PrescribedMotion(F_ext=np.array(7.0), harmonic=jm.Harmonic(frequency=np.float32(9.5))),
+        jm.PrescribedLength(x_z=jm.model.RampHold(0), noise=jm.OrnsteinUhlenbeckNoise(1, 1)),
+        jm.on_rung(jm.Isometric(), 3).replace(P_w=6, resonance_2_width=2),
+        jm.Isometric(muscle=Own()),
+    ],
+    ids=lambda t: f"{type(t).__name__} {type(t.muscle).__name__} {t.activation is None}",
+)
+def test_all_numbers_of_a_task_are_inexact_arrays(task, tmp_path):
+    """Whatever was given: whole numbers, arrays without axes, single precision. Reading one by its
+    name still gives a number of Python, and its table the same as before."""
+    assert all(map(eqx.is_inexact_array, jax.tree.leaves(task)))
+    numbers, _ = eqx.partition(task, eqx.is_inexact_array)
+    assert len(jax.tree.leaves(numbers)) == len(jax.tree.leaves(task))
+    assert all(type(value) is float for value in task.parameters.values())
+    assert "float64" not in repr((task, task.muscle, task.noise, task.parameters))
+    assert jax.tree.structure(jax.grad(lambda t: t["m_w"])(task)) == jax.tree.structure(task)
+    if not isinstance(task.muscle, Own):
+        jm.save_preset(tmp_path / "task.toml", task)
+        assert jm.load_preset(tmp_path / "task.toml") == task
+
+
+def test_own_arrays_and_tracers_stay_what_they_are(x64):
+    own = jnp.asarray(0.25)
+    assert jm.Harmonic(0.01, own).frequency is own
+    assert jax.jit(lambda f: jm.Harmonic(0.01, f).frequency)(own) == own
+    muscle = jm.Muscle(m_w=2)
+    assert muscle == jm.Muscle(m_w=2.0) and hash(muscle) == hash(jm.Muscle(m_w=np.float64(2)))
+
+
+def test_filter_grad_has_the_slope_of_every_number(x64):
     def three(task):
         whole = eqx.filter_grad(loss)(task)
         return whole.muscle.stiffness_w.k, whole.noise.amplitude[0], whole.P_w.level
 
-    found, (_, _, slopes) = at_once(three, jax.tree.map(jnp.asarray, TASK)), by_name()
+    (_, _, slopes) = by_name()
     np.testing.assert_allclose(
-        found, [slopes[name] for name in ("k_w", "noise_K_w", "P_w")], rtol=1e-9
+        at_once(three, TASK), [slopes[name] for name in ("k_w", "noise_K_w", "P_w")], rtol=1e-9
     )
 
 

@@ -13,6 +13,7 @@ from jaxmuscle.spectra._measures import (
     approximate_entropy,
     coefficient_of_variation,
     normalised,
+    peak_frequency,
     peaks,
     sample_entropy,
     signal_to_noise,
@@ -277,3 +278,64 @@ def test_peaks_need_one_spectrum(user_view):
             peaks(Spectrum(np.arange(np.shape(power)[-1]), np.asarray(power), SpectrumSettings()))
     with pytest.raises(ValueError, match="min_prominence=2"):
         peaks(spectrum([1, 2, 1]), min_prominence=2)
+
+
+def test_peak_frequency_is_the_interpolated_maximum_of_peaks(x64):
+    power = RNG.gamma(3.0, size=(4, 3, 30))
+    found = peak_frequency((SpectrumSettings().frequency, power))
+    assert found.shape == (4, 3)
+    for i in np.ndindex(4, 3):
+        assert found[i] == pytest.approx(peaks(spectrum(power[i])).maximum.interpolated, rel=1e-12)
+    many = spectrum(power[0], SpectrumSettings())
+    np.testing.assert_array_equal(peak_frequency(many), found[0])
+    mapped = jax.jit(jax.vmap(lambda p: peak_frequency((SpectrumSettings().frequency, p))))
+    np.testing.assert_allclose(mapped(power), found, rtol=1e-12)
+
+
+def test_peak_frequency_in_a_band_and_at_its_ends(x64):
+    """The largest bin itself where its peak lies beyond; NaN where there is one."""
+    f, p = np.arange(1.0, 10.0), np.array([10.0, 4, 2, 3, 1, 6, 1, 2, 1])
+    assert peak_frequency((f, p)) == 1.0
+    assert peak_frequency((f, p), 2.0) == 6.0  # symmetric
+    assert peak_frequency((f, p), 2.0, 3.0) == 2.0  # falls from 1 Hz on
+    assert 3.5 < peak_frequency((f, p), 3.0, 5.0) < 4.5
+    assert peak_frequency((f, np.where(p == 3, 0.0, p)), 3.0, 4.0) == 3.0
+    assert peak_frequency((f, np.array([1.0, 2, 2, 1, 1, 1, 1, 1, 1]))) == 2.5
+    assert peak_frequency((f, np.where(p == 6, 7.0, 0.0))) == 6.0
+    assert peak_frequency((f, np.ones(9))) == 1.0
+    assert np.isnan(peak_frequency((f, np.where(p == 6, np.nan, p))))
+
+
+def test_slopes_of_the_peak_frequency_are_those_of_differences(x64):
+    """Forward as in reverse; 0 at an end, and finite where a power is 0."""
+    f, p = np.arange(1.0, 6.0), np.array([1.0, 3.0, 5.0, 4.0, 0.0])
+
+    def at(p):
+        return peak_frequency((f, p))
+
+    forward, reverse = jax.jit(lambda p: (jax.jacfwd(at)(p), jax.grad(at)(p)))(p)
+    h = 1e-5
+    wanted = [float(at(p + h * e) - at(p - h * e)) / (2 * h) for e in np.eye(5)[:4]]
+    np.testing.assert_allclose(reverse, [*wanted, 0.0], atol=1e-9)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
+    assert np.all(np.asarray(wanted)[1:] != 0)
+    assert not np.any(jax.jit(jax.grad(at))(p[::-1] * np.array([0.0, 1, 1, 1, 9])))
+
+
+def test_peak_frequency_needs_bins(user_view):
+    f = np.arange(1.0, 10.0)
+    for given, message in (
+        ((f, np.ones(8)), "equally many"),
+        ((f[:2], np.ones(2)), "3 or more"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            peak_frequency(given)
+    with pytest.raises(ValueError, match="a band that holds a bin; they reach from 1 to 9 Hz"):
+        peak_frequency((f, f), 2.2, 2.8)
+
+
+def test_traced_peaks_are_refused_with_a_remedy():
+    with pytest.raises(
+        ValueError, match=r"JAX is tracing it .* jaxmuscle\.spectra\.peak_frequency"
+    ):
+        jax.jit(lambda p: peaks(Spectrum(np.arange(3.0), p, SpectrumSettings())))(jnp.ones(3))

@@ -1,5 +1,6 @@
 """Trees of numbers: as arrays, as plain numbers, concrete or traced."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -74,14 +75,46 @@ def as_doubles(tree: Any) -> Any:
 
 
 def as_numbers(tree: Any) -> Any:
-    """The reverse of `as_arrays`: Python floats and NumPy arrays, exact in either precision."""
+    """The reverse of `as_arrays`: NumPy's floats and arrays, exact in either precision."""
 
     def number(leaf):
         if not _is_scalar(leaf):
             return leaf
-        return float(leaf) if np.ndim(leaf) == 0 else np.asarray(leaf, dtype=float)
+        return np.float64(leaf) if np.ndim(leaf) == 0 else np.asarray(leaf, dtype=float)
 
     return jax.tree.map(number, tree)
+
+
+def as_inexact(value: Any) -> Any:
+    """A number as NumPy's float, whole numbers of an array as floats, a function (a network holds
+    some) as a tree without leaves; anything else as it is.
+
+    Of a Python float JAX makes a weak type, which the sum with a gradient has not: the second step
+    of a training would be compiled anew. And `equinox.is_inexact_array` does not see it.
+    """
+    if not _is_scalar(value):
+        function = callable(value) and not isinstance(value, type | eqx.Module)
+        return jax.tree_util.Partial(value) if function else value
+    if isinstance(value, jax.Array):
+        whole = jax.numpy.issubdtype(value.dtype, jax.numpy.integer)
+        return value.astype(jax.numpy.result_type(float)) if whole else value
+    if np.ndim(value) == 0:
+        return np.float64(value)
+    return value.astype(float) if np.issubdtype(value.dtype, np.integer) else value
+
+
+class Inexact(eqx.Module):
+    """A module whose leaves are inexact arrays, also those of a class that a user derives from it:
+    `equinox.filter_grad`, `equinox.partition` and optax see all of its numbers, and `jax.grad`
+    takes it as it is."""
+
+    def __check_init__(self):
+        for field in dataclasses.fields(self):
+            if not field.metadata.get("static", False):
+                value = jax.tree.map(
+                    as_inexact, getattr(self, field.name), is_leaf=lambda x: isinstance(x, Inexact)
+                )
+                object.__setattr__(self, field.name, value)
 
 
 def with_nulls(values: Any) -> Any:

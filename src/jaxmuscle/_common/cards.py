@@ -91,7 +91,10 @@ def _spelled(value: Any) -> str:
         and np.size(value) <= FEW
     ):
         return repr(np.asarray(value).tolist())
-    return repr(value) if isinstance(value, Spelled | tuple) else eqx.tree_pformat(value)
+    if isinstance(value, Spelled | tuple):
+        return repr(value)
+    plain = jax.tree.map(lambda x: float(x) if isinstance(x, np.floating) else x, value)
+    return eqx.tree_pformat(plain)
 
 
 class Printed(Shown):

@@ -12,10 +12,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxmuscle._common.programs import kept
 from jaxmuscle.data._target import Target
+from jaxmuscle.data._target_data import precision_of
 from jaxmuscle.model._parameters import HARMONIC, RESONANCE
 from jaxmuscle.objective._consequences import BATCH, expand
 from jaxmuscle.objective._covariance import effective_parameters
-from jaxmuscle.objective._likelihood import Bins, Likelihood, _precision, without_offsets
+from jaxmuscle.objective._likelihood import Bins, Likelihood, without_offsets
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._scoring import Maximum, maximise
 from jaxmuscle.objective._starts import continued, points_about, starting_points
@@ -239,7 +240,9 @@ def masked_bins(target: Target, masks: Float[np.ndarray, "rows bins"]) -> Bins:
         )
     law = target_law(target)
     power, half = np.log(target.proportional_power), law.degrees / 2
-    return stacked([Bins(power, half, *_precision(law.correlation, mask), mask) for mask in masks])
+    return stacked(
+        [Bins(power, half, *precision_of(law.correlation, mask), mask) for mask in masks]
+    )
 
 
 def stacked(bins: list[Bins]) -> Bins:

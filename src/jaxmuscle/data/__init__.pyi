@@ -20,6 +20,7 @@ from ._study_table import files_of_study as files_of_study
 from ._study_table import is_study as is_study
 from ._target import Target as Target
 from ._target import load_target as load_target
+from ._target_data import TargetData as TargetData
 from ._trials import Trials as Trials
 from ._trials import load_recordings as load_recordings
 from ._two_channels import movement as movement

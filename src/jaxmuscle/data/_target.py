@@ -23,6 +23,7 @@ from . import _target_fields as check
 from ._frequency_response import FrequencyResponse
 from ._measure import Measure
 from ._measured import measure_spectrum, widen_errors
+from ._target_data import TargetData
 from ._target_fields import Provenance, Quantity, numbers_of
 from ._target_files import KEYS, REQUIRED, fields_of, on_grid, read_target, settings_of
 
@@ -240,6 +241,22 @@ class Target(Shown, eqx.Module):
         return float(means.mean()), float(
             mean_error(means, max(relative, LEAST_MEAN_ERROR) * means.mean())
         )
+
+    def data(self) -> TargetData:
+        """What `log_likelihood` asks of the target, as arrays alone: a pytree for `jax.jit`,
+        `jax.grad` and `jax.vmap`.
+
+            target = jm.load_target("vastus-lateralis-26mvc")
+            height = jax.jit(jm.log_likelihood)
+            height(jm.task_for(target), target.data())
+
+        A function that is given it as an argument is compiled once for all targets with the same
+        settings, number of bins and number of trials. A target itself would be compiled in.
+
+        **Raises:** `TargetError` for a spectrum without segments: how much its bins scatter is not
+        known.
+        """
+        return TargetData.of(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write TOML that `load_target` reads back equal; an existing file is replaced in one step.

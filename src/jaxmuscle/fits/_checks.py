@@ -1,8 +1,9 @@
 """What is checked about a fit: nonlinear against linear, other minima, transients; and what is said
 about it."""
 
+import dataclasses
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -351,6 +352,26 @@ def mass_notices(coordinates: Coordinates, theta: Float[np.ndarray, " free"]) ->
                 " analyse, which look at the response alone"
             )
     return tuple(said)
+
+
+def array_notices(tasks: Iterable[AbstractTask]) -> tuple[str, ...]:
+    """The notice of a muscle that holds arrays of many numbers, a network say."""
+    said = []
+    for muscle in (task.muscle for task in tasks):
+        leaves = {
+            field.name: jax.tree.leaves(getattr(muscle, field.name))
+            for field in dataclasses.fields(muscle)
+            if not field.metadata.get("static", False)
+        }
+        sizes = {name: sum(np.size(x) for x in of if np.ndim(x)) for name, of in leaves.items()}
+        said += [
+            f"{type(muscle).__name__}.{name} holds {size} numbers in arrays. The fit left them as"
+            " they are: it moves single numbers, which have names. To train arrays, differentiate"
+            " jaxmuscle.log_likelihood by the task: docs/own-muscle.md, Train it"
+            for name, size in sizes.items()
+            if size
+        ]
+    return tuple(dict.fromkeys(said))
 
 
 def reach_notices(

@@ -16,7 +16,7 @@ from jaxmuscle._common.types import Scalar
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
-from jaxmuscle.model._parameters import PARAMETERS, proper_values
+from jaxmuscle.model._parameters import proper_values
 from jaxmuscle.model._task import require_task
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
@@ -89,20 +89,9 @@ class Problem(Shown):
             raise ValueError(
                 f"{unknown[0]!r} is not free in this problem: {choices(unknown[0], self.names)}"
             )
-        numbers = [given.get(name, start) for name, start in zip(self.names, c.centre, strict=True)]
-        if not all_concrete(numbers):
-            found = c.at(jnp.stack(jax.tree.map(jnp.asarray, numbers)))
-            return c.from_theta(jnp.where((c.low < found) & (found < c.high), found, jnp.nan), 0.0)
-        found = c.at(np.asarray(numbers, dtype=float))
-        for name, value, here, low, high in zip(
-            self.names, numbers, found, c.low, c.high, strict=True
-        ):
-            if not low < here < high:
-                raise ValueError(
-                    f"{name} = {value} lies outside what this problem can reach: give one inside"
-                    " its bounds"
-                )
-        return c.from_theta(found, 0.0)
+        return c.unbounded(
+            [given.get(name, start) for name, start in zip(self.names, c.centre, strict=True)]
+        )
 
     def task(self, theta: Theta) -> AbstractTask:
         """The task with these parameters."""
@@ -133,13 +122,8 @@ class Problem(Shown):
         """Log density of the prior as one of θ, up to a constant. Where a prior is None it is flat
         in the parameter (of a positive one in its logarithm), and improper unless that has bounds.
         """
-        scaled, theta, c = self._scaled(theta), jnp.asarray(theta), self.objective.coordinates
-        bounded = np.isfinite(c.low)
-        width = np.log(np.where(bounded, c.high - c.low, 1.0))
-        stretch = jnp.where(
-            bounded, width + jax.nn.log_sigmoid(theta) + jax.nn.log_sigmoid(-theta), 0.0
-        )
-        return jnp.sum(stretch) - 0.5 * jnp.sum((self.objective.prior_root @ scaled) ** 2)
+        scaled, stretch = self._scaled(theta), self.objective.coordinates.log_stretch(theta)
+        return stretch - 0.5 * jnp.sum((self.objective.prior_root @ scaled) ** 2)
 
     def log_density(self, theta: Theta) -> Scalar:
         """Log density of the posterior as one of θ, `log_likelihood + log_prior`: what a sampler
@@ -191,17 +175,8 @@ class Problem(Shown):
         return tuple(found)
 
     def _card(self) -> Card:
-        values = self.fit_problem.coordinates.centre
-        units = [PARAMETERS[name].unit if name in PARAMETERS else "" for name in self.names]
-        rows = tuple(
-            (name, f"{value:.5g}", "" if unit == "1" else unit)
-            for name, value, unit in zip(self.names, values, units, strict=True)
-        )
         heading = f"problem of {self.fit_problem.title} with {len(self.names)} free parameters"
-        text = "\n".join(
-            [heading, *(f"  {name:<24}{value:<12}{unit}".rstrip() for name, value, unit in rows)]
-        )
-        return Card(text, heading, ("name", "start", "unit"), rows)
+        return self.fit_problem.coordinates.card(heading)
 
 
 def problem(  # noqa: PLR0913 (options of a public call)

@@ -35,6 +35,7 @@ from jaxmuscle.spectra._settings import WINDOW
 from ._adequacy import Endpoint, elsewhere
 from ._checks import (
     Stage,
+    array_notices,
     controlled_moments,
     convergence,
     further_notices,
@@ -234,6 +235,7 @@ def report_fit(
             *why,
             *twitch_notices(derived),
             *mass_notices(problem.coordinates, theta),
+            *array_notices(tasks),
             *reach_notices(derived, parts),
             *polish_notices(polish),
             *of_several(parts),

@@ -2,12 +2,11 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import require
+from jaxmuscle._common.arrays import Inexact, require
 from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.quadrature import NODES, WEIGHTS
 from jaxmuscle._common.types import Scalar
@@ -36,7 +35,7 @@ class Transition(NamedTuple):
         )
 
 
-class Activation(Spelled, eqx.Module):
+class Activation(Spelled, Inexact):
     """`H_a(s) = 1 / (1 + s T)²`, impulse response `t/T² exp(-t/T)`: a twitch with the contraction
     time T.
 

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import require
+from jaxmuscle._common.arrays import Inexact, require
 from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.types import Scalar
 
 from ._parameters import default
 
 
-class AbstractLaw(Spelled, eqx.Module):
+class AbstractLaw(Spelled, Inexact):
     """A material coefficient as a function of one kinematic quantity.
 
     Write one class with a `__call__` to replace the paper's quadratic laws, an exponential toe
@@ -78,7 +78,7 @@ class QuadraticDamping(AbstractLaw):
 Perturbation = Float[Array, " inputs"]
 
 
-class AbstractMuscle(Spelled, eqx.Module):
+class AbstractMuscle(Spelled, Inexact):
     """A deterministic muscle that takes the perturbations `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z, ΔP_w /
     P_w)` as an input.
 

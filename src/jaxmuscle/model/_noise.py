@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxmuscle._common.arrays import require
+from jaxmuscle._common.arrays import Inexact, as_inexact, require
 from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.types import Scalar
 
@@ -89,7 +89,7 @@ class ShapingFilter(eqx.Module):
     L: Float[Array, " inputs"]
 
 
-class AbstractNoise(Spelled, eqx.Module):
+class AbstractNoise(Spelled, Inexact):
     """Noise on the coefficients K_w, K_z, C_w, C_z and the drive P_w, an independent channel each
     (`shared`: one for all).
 
@@ -256,7 +256,7 @@ def as_amplitude(value: Amplitude) -> Scalar:
             if _any_jax(value)
             else np.array(value, dtype=float)
         )
-    return value
+    return as_inexact(value)
 
 
 def _any_jax(values: tuple | list) -> bool:

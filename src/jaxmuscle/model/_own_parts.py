@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from jaxmuscle._common.arrays import is_concrete, require
+from jaxmuscle._common.arrays import as_arrays, as_doubles, is_concrete, require
 from jaxmuscle._common.errors import FirstOrderWarning
 
 from ._muscle import AbstractLaw, AbstractMuscle, Muscle
@@ -110,6 +110,7 @@ def _check_method(
 ) -> None:
     """Without computing anything: JAX follows the method with numbers of no value."""
     call = f"{type(part).__name__}.{method}({', '.join(arguments)})"
+    part = as_arrays(part)  # a network may have another precision
     try:
         found = jax.eval_shape(
             getattr(part, method), *(jnp.zeros(5 if name == "u" else ()) for name in arguments)
@@ -138,6 +139,7 @@ def _check_method(
 def _check_inverse(muscle: AbstractMuscle) -> None:
     """`contraction_velocity` must be where `passive_force` is as given: at one point in numbers."""
     x_w, v_w, x_z, v_z = 1e-3, 0.02, 5e-4, 0.01
+    muscle = as_doubles(muscle)
     with jax.enable_x64(True):
         here, moving, there, speed, still = (
             *(jnp.asarray(value) for value in (x_w, v_w, x_z, v_z)),
@@ -163,6 +165,7 @@ def _check_slopes(muscle: AbstractMuscle) -> None:
     Where the slopes to the two sides differ, one of them; a warning says which. Differences over h
     and h / 2, extrapolated.
     """
+    muscle = as_doubles(muscle)
     own = type(muscle).contraction_velocity is not AbstractMuscle.contraction_velocity
     methods = [m for m, (_, shape, _) in ASKED.items() if not shape and (own or m != INVERSE)]
     with jax.enable_x64(True):

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxmuscle._common.arrays import _is_scalar, checked, is_concrete, require
+from jaxmuscle._common.arrays import _is_scalar, as_inexact, checked, is_concrete, require
 from jaxmuscle._common.text import choices
 
 _HAND = (
@@ -421,7 +421,8 @@ def get_parameter(task: Any, name: str) -> Any:
         return task.muscle.base()[tuple(BASE).index(name)]
     if name in OFF and name not in paths_of(task):
         return 0.0
-    return _follow(task, _path(task, name))
+    value = _follow(task, _path(task, name))
+    return float(value) if isinstance(value, np.floating) else value
 
 
 def set_parameters(task: Any, values: dict[str, Any]) -> Any:
@@ -491,7 +492,7 @@ def _with_values(task: Any, values: dict[str, Any]) -> Any:
             parts[index] = value
             value = _stack(parts)
         task = eqx.tree_at(
-            lambda t, f=fields: _follow(t, f), task, value, is_leaf=lambda x: x is None
+            lambda t, f=fields: _follow(t, f), task, as_inexact(value), is_leaf=lambda x: x is None
         )
     return task
 

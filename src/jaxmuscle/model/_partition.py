@@ -24,9 +24,8 @@ def partition(
 
     Use it to move some parameters and to keep the others. `values` are arrays of JAX's default
     precision, in their natural units: any optimiser of pytrees (optax, optimistix) can move them.
-    (`jax.grad` takes a task as it is, and gives a slope for every number of it.
-    `equinox.filter_grad` gives None for all of them: a task holds Python numbers, which are exact
-    in either precision, and not arrays.)
+    (`jax.grad` and `equinox.filter_grad` take a task as it is, and give a slope for every number of
+    it. `jaxmuscle.free` makes a vector without bounds of some.)
 
     **Arguments:** `task`; `names` of its parameters (`task.parameter_names` are all).
 

@@ -13,14 +13,14 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import require
+from jaxmuscle._common.arrays import Inexact, require
 from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.types import Scalar
 
 from ._parameters import default
 
 
-class AbstractSignal(Spelled, eqx.Module):
+class AbstractSignal(Spelled, Inexact):
     """A scalar function of time [s] with a `level` (its held value, the parameter a fit can move).
 
     `smoothness` counts its continuous derivatives.
@@ -44,7 +44,7 @@ class Constant(AbstractSignal):
         return self.level + 0.0 * t
 
 
-class Harmonic(Spelled, eqx.Module):
+class Harmonic(Spelled, Inexact):
     """`S(t) = amplitude envelope(t) sin(2π frequency t + phase)`, a fraction of the base stiffness
     K_j0 of both tissues.
 

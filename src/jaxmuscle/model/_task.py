@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import _is_scalar, checked, is_concrete, require
+from jaxmuscle._common.arrays import Inexact, _is_scalar, checked, is_concrete, require
 from jaxmuscle._common.cards import Card, Shown, in_columns
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.spectra._settings import SpectrumSettings
@@ -61,7 +61,7 @@ def proper_part(name: str, value: Any) -> Any:
     return value
 
 
-class AbstractTask(Shown, eqx.Module):
+class AbstractTask(Shown, Inexact):
     """What is simulated: `y' = vector_field(t, y, u)`, observed as `output(t, y, u, u')`.
 
     `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z, ΔP_w / P_w)` [N/m, N s/m, 1] is the perturbation of coefficients

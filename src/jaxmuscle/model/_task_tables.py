@@ -97,7 +97,7 @@ def _to_table(value: Any) -> Any:
         if _known().get(type(value).__name__) is not type(value):
             _refuse(value)
         return {"type": type(value).__name__} | _fields_to_table(value)
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | np.floating):
         return value.tolist()
     return [_to_table(each) for each in value] if isinstance(value, tuple) else value
 

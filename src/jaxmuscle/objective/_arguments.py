@@ -136,7 +136,7 @@ def free_names(
         names = [name for name in usually_free(task, usual) if name not in fix]
     else:
         names = list(dict.fromkeys(free))
-        _check_names("free", names, known)
+        check_names("free", names, known)
         both = sorted(set(names) & set(fix))
         if both:
             raise ValueError(f"{', '.join(both)} cannot be both free and fixed")
@@ -150,7 +150,8 @@ def free_names(
     return tuple(names)
 
 
-def _check_names(argument: str, names: Iterable[str], known: Iterable[str]) -> None:
+def check_names(argument: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse names that are not among the known ones."""
     known = list(known)
     for name in names:
         if name not in known:
@@ -291,8 +292,8 @@ def planned(
     names = free_names(task, options.free, fix, target)
     names += tuple(name for name in options.also_free if name not in names)
     mean = options.mean_force if isinstance(options.mean_force, tuple) else None
-    _check_names("priors", priors, names)
-    _check_names("bounds", bounds, names)
+    check_names("priors", priors, names)
+    check_names("bounds", bounds, names)
     check_line(task, target.settings)
     spectral, settings = len(target.bins) > 0, target.settings
     require(
@@ -323,10 +324,7 @@ def planned(
         raise ValueError("seeds = 0: a Monte Carlo fit needs at least one")
     usual = {n: PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0 for n in names}
     sds = {n: priors.get(n, usual[n]) for n in names}
-    tremor = TREMOR.get(task.quantity, MOVING)
-    for name, (low, high) in (("resonance_frequency", tremor), ("resonance_2_frequency", SLOWER)):
-        if name in names and low < float(task[name]) < high:
-            bounds.setdefault(name, (low, high))
+    bounds = tremor_bounds(task, names) | bounds
     coordinates = Coordinates.of(
         {n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()}
     )
@@ -367,6 +365,17 @@ def planned(
     return Plan(
         problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed
     )
+
+
+def tremor_bounds(task: AbstractTask, names: Iterable[str]) -> dict[str, tuple[float, float]]:
+    """Bounds of the resonances among the names that begin in the band where people have them."""
+    tremor = TREMOR.get(task.quantity, MOVING)
+    bands = {"resonance_frequency": tremor, "resonance_2_frequency": SLOWER}
+    return {
+        name: band
+        for name, band in bands.items()
+        if name in names and band[0] < float(task[name]) < band[1]
+    }
 
 
 def damping_row(

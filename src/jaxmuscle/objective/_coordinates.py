@@ -1,5 +1,6 @@
 """Free parameters as unconstrained numbers."""
 
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -9,8 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import expit
 
+from jaxmuscle._common.arrays import all_concrete
+from jaxmuscle._common.cards import Card
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._parameters import PARAMETERS, Parameter, set_parameters
+from jaxmuscle.model._task import in_numbers
 from jaxmuscle.model._tasks import AbstractTask
 
 Numbers = TypeVar("Numbers", bound=Float[Array | np.ndarray, "*batch free"])
@@ -136,6 +140,47 @@ class Coordinates(eqx.Module):
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = xp.where(self.positive, values, 1.0) / xp.where(self.positive, self.centre, 1.0)
             return xp.where(self.positive, xp.log(ratio), values - self.centre) / self.sd
+
+    def unbounded(self, values: Sequence[Any]) -> Any:
+        """s of the parameters' natural values, in the order of `names`.
+
+        JAX may trace the values; a traced one outside its bounds is NaN. Raises `ValueError` for a
+        concrete one.
+        """
+        if not all_concrete((values, self)):
+            found = self.at(jnp.stack(jax.tree.map(jnp.asarray, list(values))))
+            inside = (self.low < found) & (found < self.high)
+            return self.from_theta(jnp.where(inside, found, jnp.nan), 0.0)
+        found = self.at(np.asarray(values, dtype=float))
+        for name, value, here, low, high in zip(
+            self.names, values, found, self.low, self.high, strict=True
+        ):
+            if not low < here < high:
+                raise ValueError(
+                    f"{name} = {value} lies outside what this problem can reach: give one inside"
+                    " its bounds"
+                )
+        return self.from_theta(found, 0.0)
+
+    def log_stretch(self, s: Float[Array | np.ndarray, " free"]) -> Scalar:
+        """ln |dθ/ds|."""
+        xp, _ = self._library(s)
+        bounded = xp.isfinite(self.low)
+        width = xp.log(xp.where(bounded, self.high - self.low, 1.0))
+        share = jax.nn.log_sigmoid(s) + jax.nn.log_sigmoid(-s)
+        return jnp.sum(jnp.where(bounded, width + share, 0.0))
+
+    def card(self, heading: str) -> Card:
+        """The parameters with their values at θ = 0."""
+        units = [PARAMETERS[name].unit if name in PARAMETERS else "" for name in self.names]
+        rows = tuple(
+            (name, in_numbers(value), "" if unit == "1" else unit)
+            for name, value, unit in zip(self.names, self.centre, units, strict=True)
+        )
+        text = "\n".join(
+            [heading, *(f"  {name:<24}{value:<12}{unit}".rstrip() for name, value, unit in rows)]
+        )
+        return Card(text, heading, ("name", "start", "unit"), rows)
 
     def theta_of(
         self, name: str, values: Float[np.ndarray, "*values"] | float

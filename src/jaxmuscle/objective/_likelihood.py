@@ -3,7 +3,7 @@ drawn from it."""
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.data._recording import Recording
 from jaxmuscle.data._target import Target
+from jaxmuscle.data._target_data import TargetData, precision_of
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments, check_line
 from jaxmuscle.response._expected_moments import expected_moments
@@ -29,12 +30,11 @@ from jaxmuscle.spectra._bin_law import (
     bin_statistics,
     recorded_interval,
     target_law,
-    trial_samples,
 )
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._consequences import Expansion, expand
-from ._problem import FitProblem, target_variation
+from ._problem import FitProblem, variation_under
 from ._residuals import Residuals, data_residuals, further_residuals
 
 
@@ -84,16 +84,11 @@ def measured_bins(target: Target, mask: np.ndarray | None = None) -> Bins:
     law = target_law(target)
     kept = np.ones(len(target.bins)) if mask is None else np.asarray(mask, dtype=float)
     return Bins(
-        np.log(target.proportional_power), law.degrees / 2, *_precision(law.correlation, kept), kept
+        np.log(target.proportional_power),
+        law.degrees / 2,
+        *precision_of(law.correlation, kept),
+        kept,
     )
-
-
-def _precision(correlation: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    kept = np.flatnonzero(mask)
-    part = correlation[np.ix_(kept, kept)]
-    whole = np.zeros_like(correlation)
-    whole[np.ix_(kept, kept)] = np.linalg.inv(part)
-    return whole, np.asarray(np.linalg.slogdet(part)[1])
 
 
 def log_density(bins: Bins, power: ManyPowers, line: ManyPowers, offset: Scalar) -> Many:
@@ -325,15 +320,17 @@ def _gaussian(residuals: Float[Array | np.ndarray, " rows"]) -> Scalar:
 
 
 @kept
-def _target_likelihood(task, bins, chosen, variation, sampled, stiffness):
-    moments, system = expected_moments(task, task.settings, WINDOW, *sampled)
-    found = (
-        jnp.zeros(())
-        if bins is None
-        else log_marginal(bins, moments.power[chosen], moments.line[chosen])
-    )
-    if stiffness is not None:
-        f, measured, sd = stiffness
+def _target_likelihood(task, data, variation):
+    samples = jnp.round(jnp.mean(data.samples)).astype(data.samples.dtype)
+    moments, system = expected_moments(task, data.settings, WINDOW, samples, data.recorded)
+    found = jnp.zeros(())
+    if len(data.chosen):
+        bins = Bins(
+            data.log_power, data.half, data.precision, data.logdet, jnp.ones_like(data.half)
+        )
+        found = log_marginal(bins, moments.power[data.chosen], moments.line[data.chosen])
+    if data.stiffness is not None:
+        f, measured, sd = data.stiffness
         found += jnp.sum(
             -0.5 * ((parts_of_stiffness(task, system, f) - measured) / sd) ** 2 - jnp.log(sd)
         )
@@ -354,7 +351,7 @@ def _whittle(task, settings, power, window, recorded):
     )
 
 
-def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
+def log_likelihood(task: AbstractTask, data: Target | TargetData | Recording) -> Scalar:
     """Log likelihood of measured data under a task in linear response; differentiable in the task.
 
         target = jm.load_target("vastus-lateralis-26mvc")
@@ -364,11 +361,14 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
     spectrum (docs/uncertainty.md, *The likelihood*), their unknown total integrated out; with its
     coefficient of variation as one more datum, Gaussian in the log with the standard deviation that
     it has under this task, if it states one; and with its dynamic stiffness, Gaussian in real and
-    imaginary part with the errors that it states, if it has one. A `Recording`: the Whittle
-    likelihood of the periodogram of its window, in its own units, between the first and last bin of
-    the task's settings, about the *expected* periodogram of a window of that length (leakage and
-    aliases included: debiased Whittle, Sykulski et al. 2019, doi:10.1093/biomet/asy071). With the
-    periodogram I_k and its expectation E_k = N_k + L_k, N_k from the noise and L_k from the line,
+    imaginary part with the errors that it states, if it has one. `target.data()` is the same as
+    arrays, for an argument of what you compile: under `jit` it is traced once for all targets with
+    the same settings, number of bins and number of trials, and `vmap` maps it over people. A
+    `Recording`: the Whittle likelihood of the periodogram of its window, in its own units, between
+    the first and last bin of the task's settings, about the *expected* periodogram of a window of
+    that length (leakage and aliases included: debiased Whittle, Sykulski et al. 2019,
+    doi:10.1093/biomet/asy071). With the periodogram I_k and its expectation E_k = N_k + L_k, N_k
+    from the noise and L_k from the line,
 
         Σ_k [ln I0(2 √(I_k L_k) / N_k) - (I_k + L_k) / N_k - ln N_k],
 
@@ -376,35 +376,47 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
     without a line `-Σ (ln E_k + I_k / E_k)`.
 
     **Raises:** `ValueError` for a target without segments, a harmonic beyond half the sampling
-    rate, and a recording whose window is constant, too short, or sampled too slowly for the bins.
+    rate, a recording whose window is constant, too short, or sampled too slowly for the bins, and
+    for data of several people without `vmap`.
     """
+    if isinstance(data, Target):
+        if not all_concrete(data):
+            raise ValueError(
+                f"data: JAX is tracing the target {data.name!r}. Give its arrays instead:"
+                " log_likelihood(task, target.data())"
+            )
+        data = data.data()
     if all_concrete(task):
         check_line(task, task.settings)
         check_inputs(task)
-        warn_beyond(task, data.settings if isinstance(data, Target) else None)
-    if isinstance(data, Target):
-        task = task.with_parts(settings=data.settings)
-        bins = jax.tree.map(jnp.asarray, measured_bins(data)) if len(data.bins) else None
-        variation = target_variation(data, task)
-        sampled = (
-            jnp.asarray(trial_samples(data)),
-            jnp.asarray(recorded_interval(data, data.settings)),
-        )
-        stiffness = None
-        if data.stiffness is not None:
-            known = data.stiffness.known
-            stiffness = as_arrays(
-                (
-                    known.frequency,
-                    np.stack([np.real(known.value), np.imag(known.value)]),
-                    known.stderr,
-                )
+        warn_beyond(task, data.settings if isinstance(data, TargetData) else None)
+    if isinstance(data, TargetData):
+        if np.ndim(data.log_power) != 1:
+            raise ValueError(
+                f"data: these are of {len(data.log_power)} targets in one. Map over them:"
+                " jax.vmap(jaxmuscle.log_likelihood)(tasks, data), or, of one task, with"
+                " in_axes=(None, 0)"
             )
-        chosen = data.bins - data.settings.first_bin
-        return _target_likelihood(as_arrays(task), bins, chosen, variation, sampled, stiffness)
+        task, data = as_arrays(task.with_parts(settings=data.settings)), _as_arrays(data)
+        variation = None
+        if data.log_variation is not None:
+            variation = as_arrays(
+                variation_under(task, data.settings, data.log_variation, data.samples, data.longest)
+            )
+        return _target_likelihood(task, data, variation)
     whole = data.fft_spectrum(task.settings.replace(window="boxcar", tapers=1))
     duration = whole.settings.length / whole.settings.rate
     recorded = jnp.asarray(recorded_interval(data, whole.settings))
     return _whittle(
         as_arrays(task), whole.settings, jnp.asarray(whole.power), (0.0, duration), recorded
     )
+
+
+def _as_arrays(data: TargetData) -> TargetData:
+    """In the caller's precision, as `as_arrays`; whole numbers stay whole."""
+
+    def array(leaf: Any) -> Any:
+        whole = np.issubdtype(leaf.dtype, np.integer)
+        return as_arrays(leaf, leaf.dtype if whole else None)
+
+    return jax.tree.map(array, data)

@@ -9,10 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
 from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers, is_concrete
 from jaxmuscle.data._target import Target
+from jaxmuscle.data._target_data import longest
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
@@ -29,7 +30,7 @@ from jaxmuscle.spectra._bin_law import (
     samples_of,
     trial_samples,
 )
-from jaxmuscle.spectra._settings import WINDOW
+from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
 from ._coordinates import Coordinates, task_at
 from ._moment_models import Linear, MonteCarlo
@@ -41,24 +42,47 @@ MOST_SUBSTEPS = 16
 def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[Any, Any] | None:
     """Log coefficient of variation of a target and its standard deviation.
 
-    With a task and where the target states its segments: `variation_sd` of recordings that give
-    so many. Else half the relative error of the power in the bins, `½ √(pᵀ V p)` with V the
-    covariance of the log powers, which is too much where power lies elsewhere or in a harmonic. The
-    `mean_error` of several trials where their scatter is larger.
+    With a task and where the target states its segments: `variation_under` it. Else half the
+    relative error of the power in the bins, `½ √(pᵀ V p)` with V the covariance of the log powers,
+    which is too much where power lies elsewhere or in a harmonic. The `mean_error` of several
+    trials where their scatter is larger.
     """
     values = target.coefficient_of_variation
     if values is None:
         return None
     logs = np.log(np.asarray(values))
-    p = np.asarray(target.proportional_power)
-    sd: Any = 0.5 * np.sqrt(p @ bin_statistics(target).covariance @ p)
     if task is not None and target.segments is not None:
-        settings, counts = target.settings, target.segments
-        each = {k: variation_sd(task, settings, samples_of(k, settings)) for k in set(counts)}
-        each = as_numbers(each) if all_concrete(each) else each
-        sd = sum(each[k] ** 2 for k in counts) ** 0.5 / len(counts)
-    sd = mean_error(logs, sd)
-    return float(logs.mean()), float(sd) if is_concrete(sd) else sd
+        samples = np.array([samples_of(count, target.settings) for count in target.segments])
+        mean, sd = variation_under(
+            task, target.settings, logs, samples, longest(int(samples.max()))
+        )
+        return mean, float(sd) if is_concrete(sd) else sd
+    p = np.asarray(target.proportional_power)
+    sd = mean_error(logs, 0.5 * np.sqrt(p @ bin_statistics(target).covariance @ p))
+    return float(logs.mean()), float(sd)
+
+
+def variation_under(
+    task: AbstractTask,
+    settings: SpectrumSettings,
+    logs: Float[Array | np.ndarray, " values"],
+    samples: Int[Array | np.ndarray, " trials"],
+    most: int,
+) -> tuple[Any, Any]:
+    """Mean of log coefficients of variation, and the standard deviation that it has under a task:
+    `variation_sd` of trials with so many samples, at `most` of the number that their program
+    has.
+
+    The `mean_error` of several trials where their scatter is larger.
+    """
+    if all_concrete((task, samples)):
+        known = {n: float(variation_sd(task, settings, n, most)) for n in set(samples.tolist())}
+        each = np.array([known[int(n)] for n in samples])
+        expected = np.sqrt(np.sum(each**2)) / len(samples)
+    else:
+        each = jax.vmap(lambda n: variation_sd(task, settings, n, most))(samples)
+        expected = jnp.sqrt(jnp.sum(each**2)) / len(samples)
+    return (np if is_concrete(logs) else jnp).mean(logs), mean_error(logs, expected)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Public names of this wing."""
 
+from ._autocovariance_at import autocovariance as autocovariance
 from ._characteristics import StaticCharacteristics as StaticCharacteristics
 from ._characteristics import static_characteristics as static_characteristics
 from ._equilibrium import equilibrium as equilibrium
@@ -7,6 +8,8 @@ from ._expected_spectrum import expected_spectrum as expected_spectrum
 from ._expected_spectrum import expected_variation as expected_variation
 from ._input_response import dynamic_stiffness as dynamic_stiffness
 from ._input_response import noise_density as noise_density
+from ._linearised import Linearisation as Linearisation
+from ._linearised import linearise as linearise
 from ._linearised import settled as settled
 from ._presets import load_preset as load_preset
 from ._presets import save_preset as save_preset

@@ -20,10 +20,6 @@ from ._harmonic_line import harmonic_line
 from ._linearised import Linearisation, linearise
 from ._rows import Sampled, moments_of_rows, variation_sd_of_numbers
 
-# a program is made for so many samples, for 4 times, 16 times ... as many, and serves all below
-LAGS = 4096
-
-
 _response = kept(response)  # compiled apart, so that it is traced once
 
 
@@ -45,14 +41,12 @@ def expected_moments(
 
 
 def variation_sd(
-    task: AbstractTask, settings: SpectrumSettings, samples: int
-) -> Float[Array | np.ndarray, ""]:
-    """`log_variation_sd` of a task's output; of numbers by the programs of `moments_of_rows`."""
-    most = LAGS
-    while most < samples:
-        most *= 4
+    task: AbstractTask, settings: SpectrumSettings, samples: Any, most: int
+) -> Float[Array, ""]:
+    """`log_variation_sd` of a task's output, by a program for at `most` so many samples: trials are
+    rarely of one length."""
     lags = most + len(low_pass_spread(settings)) // 2
-    if all_concrete(task):
+    if all_concrete((task, samples)):
         return variation_sd_of_numbers(task, Sampled(settings, WINDOW, samples, 0.0), lags)
     return _variation_sd(as_arrays(task), settings, samples, lags)
 

@@ -25,8 +25,13 @@ from ._equilibrium import HOLD, equilibrium, mechanics
 
 
 class Linearisation(NamedTuple):
-    """`y' = A (y - point) + B u`, `z = rest + C (y - point) + D u + E u'`: a task about its
-    equilibrium."""
+    """A task about its equilibrium, `y' = A (y - point) + B u`, `z = rest + C (y - point) + D u + E
+    u'`. Made by `linearise`.
+
+    y are the states (`task.state_names`), z is the output (`task.output_name`), and u are the five
+    perturbations (ΔK_w, ΔK_z [N/m], ΔC_w, ΔC_z [N s/m], ΔP_w / P_w). `point` is y, and `rest` is z
+    at the equilibrium.
+    """
 
     point: Float[Array, " states"]
     rest: Float[Array, ""]
@@ -38,11 +43,36 @@ class Linearisation(NamedTuple):
 
 
 def linearise(task: AbstractTask, time: Scalar | float = HOLD) -> Linearisation:
-    """Jacobians of the task's own vector field and output at its equilibrium under the inputs at
-    `time` [s].
+    """Jacobians of a task's vector field and output at its equilibrium under the inputs at `time`
+    [s].
 
-    Of a `LinearTask` what it was made of.
+        system = jm.response.linearise(jm.Isometric())
+        np.linalg.eigvals(system.A)  # 1/s
+
+        A = ∂f/∂y,   B = ∂f/∂u,   C = ∂z/∂y,   D = ∂z/∂u,   E = ∂z/∂u'
+
+    with f the `vector_field` and z the `output` of the task. All of the linear response follows
+    from this and from the noise: the transfer function from u to z is `C (s - A)⁻¹ B + D + s E`.
+
+    **Arguments:** `task`; `time` [s], 15 s by default. **Returns:** a `Linearisation`: `point`
+    (states,), `rest` (), `A` (states, states), `B` (states, 5), `C` (states,), `D` and `E` (5,).
+    Differentiable, also under `jit` and `vmap`.
+
+    **Raises:** `OperatingPointError` (a `ValueError`) without a stable, damped equilibrium, and,
+    unless a time is given, where an input moves in the analysed window. Under a transformation
+    nothing is raised: without an equilibrium the result is not finite.
     """
+    if isinstance(task, LinearTask) or not all_concrete((task, time)):
+        return _linearise(task, time)
+    if time == HOLD:
+        check_inputs(task)
+    system = linearisation(task, time)
+    check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
+    return system
+
+
+def _linearise(task: AbstractTask, time: Scalar | float = HOLD) -> Linearisation:
+    """`linearise` without checks."""
     if isinstance(task, LinearTask):
         return task.system
     point = equilibrium(task, time)
@@ -156,7 +186,7 @@ def _operating_points(
 
     def one(values):
         there = set_parameters(task, dict(zip(names, values, strict=True)))
-        system = linearise(there, time)
+        system = _linearise(there, time)
         return Operating(system, balanced(system), there.muscle.base())
 
     return jax.vmap(lambda values: value_and_slopes(one, values))(values)
@@ -309,9 +339,9 @@ def in_parts(program: Callable[..., Any], *rows: Any) -> Any:
 
 
 def linearisation(task: AbstractTask, time: float = HOLD) -> Linearisation:
-    """`linearise`; of a task of numbers by the program that fits use."""
+    """`linearise` without checks; of a task of numbers by the program that fits use."""
     if isinstance(task, LinearTask) or not all_concrete(task):
-        return linearise(task, time)
+        return _linearise(task, time)
     mechanics_of = Mechanics.of(task)
     return jax.tree.map(lambda x: x[0], mechanics_of.at(np.zeros((1, 0)), time)[1].point.system)
 

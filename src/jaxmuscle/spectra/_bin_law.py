@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex, Float
 from scipy.special import digamma, gammaincinv, ndtr, polygamma, stdtrit
 
 from jaxmuscle._common.arrays import is_concrete
@@ -127,7 +127,7 @@ def student(count: int) -> float:
     return float(stdtrit(count - 1, 0.975))
 
 
-def mean_error(values: Float[np.ndarray, " trials"], expected: Any) -> Any:
+def mean_error(values: Float[Array | np.ndarray, " trials"], expected: Any) -> Any:
     """The error of a mean over trials: the `expected` one, or that by their scatter where this is
     larger.
 
@@ -138,9 +138,10 @@ def mean_error(values: Float[np.ndarray, " trials"], expected: Any) -> Any:
     count = len(values)
     if count < 2:
         return expected
-    scatter = float(np.std(values, ddof=1)) / np.sqrt(count)
+    concrete = is_concrete(values) and is_concrete(expected)
+    scatter = (np if is_concrete(values) else jnp).std(values, ddof=1) / np.sqrt(count)
     stated = scatter * (student(count) / NORMAL if count >= ENOUGH else 1.0)
-    return (np if is_concrete(expected) else jnp).where(scatter > expected, stated, expected)
+    return (np if concrete else jnp).where(scatter > expected, stated, expected)
 
 
 class BinStatistics(NamedTuple):

@@ -4,6 +4,7 @@ peaks."""
 from typing import Any, Literal, get_args
 
 import equinox as eqx
+import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,8 @@ import scipy
 from jaxtyping import Array, Float, Real
 
 from jaxmuscle._common.arguments import require
+from jaxmuscle._common.arrays import all_concrete, as_arrays
+from jaxmuscle._common.programs import kept
 
 from ._fluctuations import one_record
 from ._neighbours import neighbours
@@ -254,8 +257,14 @@ def peaks(spectrum: Spectrum, *, min_prominence: float = 0.01) -> Peaks:
     [Hz], proportional `power` and `prominence`.
 
     **Raises:** `ValueError` for leading axes, fewer than 3 bins, and power that is not finite or
-    all zero.
+    all zero, and under `jit`, `grad` and `vmap`: there use `peak_frequency`.
     """
+    if not all_concrete(spectrum):
+        raise ValueError(
+            "spectrum: JAX is tracing it (inside jit, grad or vmap), and how many peaks it has is"
+            " not known there. Use jaxmuscle.spectra.peak_frequency, which can be traced, or call"
+            " peaks outside"
+        )
     p = np.asarray(spectrum.proportional, dtype=float)
     one = p.ndim == 1 and p.size >= 3
     require(
@@ -276,6 +285,67 @@ def peaks(spectrum: Spectrum, *, min_prominence: float = 0.01) -> Peaks:
     inside = 0 < top < p.size - 1
     height = scipy.signal.peak_prominences(p, [top])[0][0] if inside else p[top] - p.min()
     return Peaks(_peak(spectrum, p, top, height), tuple(_peak(spectrum, p, k, h) for k, h in pairs))
+
+
+def peak_frequency(
+    spectrum: Spectrum | tuple[Any, Any], low: float | None = None, high: float | None = None
+) -> Float[Array, "*batch"]:
+    """Frequency [Hz] of the highest peak of a spectrum; differentiable, also in `jit` and `vmap`.
+
+        spectrum = jm.expected_spectrum(jm.Isometric())
+        jm.spectra.peak_frequency(spectrum, 2.0, 6.0)
+
+        f_k + Δf (l_{k-1} - l_{k+1}) / (2 (l_{k-1} - 2 l_k + l_{k+1}))
+
+    is the vertex of the parabola through the log power l of the largest bin k and its neighbours,
+    at most half a bin away. Where k is the first or the last bin, where a neighbour is larger (the
+    largest bin between `low` and `high` then lies at one end, and its peak beyond), and where a
+    power of the three is 0, it is f_k itself, whose derivative is 0. The choice of k is not
+    differentiated: where two bins are equal the frequency jumps.
+
+    **Arguments:** `spectrum`, a `Spectrum`, or a pair of frequencies [Hz] (bins,) and power
+    (..., bins) in any unit; `low` and `high` [Hz]: only bins between them are looked at, ends
+    included.
+
+    **Returns:** one frequency for each spectrum. NaN where a power is NaN.
+
+    **Raises:** `ValueError` for fewer than 3 bins, unequal shapes, and no bin between `low` and
+    `high`.
+    """
+    frequency, power = (
+        (spectrum.bins, spectrum.power) if isinstance(spectrum, Spectrum) else spectrum
+    )
+    shapes = np.shape(frequency), np.shape(power)
+    fit = len(shapes[0]) == 1 and shapes[1][-1:] == shapes[0] and shapes[0][0] >= 3
+    remedy = "give equally many of both along the last axis, 3 or more"
+    require(fit, "shapes of frequency, power", shapes, remedy)
+    ends = (-np.inf if low is None else low), (np.inf if high is None else high)
+    if all_concrete((frequency, ends)):
+        f = np.asarray(frequency)
+        inside = np.any((f >= ends[0]) & (f <= ends[1]))
+        remedy = f"give a band that holds a bin; they reach from {f[0]:.4g} to {f[-1]:.4g} Hz"
+        require(bool(inside), "low, high", ends, remedy)
+    return _peak_frequency(*as_arrays((frequency, power, *ends)))
+
+
+@kept
+def _peak_frequency(
+    frequency: Float[Array, " bins"], power: Float[Array, "*batch bins"], low: Array, high: Array
+) -> Float[Array, "*batch"]:
+    def one(p: Float[Array, " bins"]) -> Float[Array, ""]:
+        seen = jnp.where((frequency >= low) & (frequency <= high), p, -jnp.inf)
+        k = jnp.argmax(jax.lax.stop_gradient(seen))
+        at = jnp.clip(k, 1, len(p) - 2) + jnp.arange(-1, 2)
+        f, three = frequency[at], p[at]
+        positive = three > 0
+        left, middle, right = jnp.log(jnp.where(positive, three, 1.0))
+        curvature = left - 2 * middle + right
+        top = (middle >= left) & (middle >= right) & (curvature < 0)
+        vertex = (at[1] == k) & jnp.all(positive) & top
+        away = (f[2] - f[0]) / 4 * (left - right) / jnp.where(vertex, curvature, -1.0)
+        return jnp.where(jnp.isnan(p[k]), jnp.nan, frequency[k] + jnp.where(vertex, away, 0.0))
+
+    return jax.vmap(one)(power.reshape(-1, len(frequency))).reshape(power.shape[:-1])
 
 
 def _peak(
