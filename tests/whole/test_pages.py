@@ -380,6 +380,7 @@ def test_coming_from_elsewhere():
         names = pages.run("docs/coming-from-diffrax.md", {}, whole)
         first = float(names["loss"]((names["logs"], names["Sensor"](jax.numpy.asarray(-5.0)))))
     assert float(names["value"]) < 0.9 * first  # the loop of optax went downhill
+    assert names["heights"][-1] < names["heights"][0] - 10  # and that of every number
     assert names["many"].shape == (8,) and np.all(np.isfinite(names["solution"].ys))
     # Welch power of one recording scatters by half, so the mean of eight by less than a fifth.
     assert 0.2 < names["many"].mean() / float(jm.expected_spectrum(jm.Isometric()).power[10]) < 1.8
