@@ -408,8 +408,8 @@ def value_of(task: Any, path: tuple) -> Any:
     """The value at a path, without a computation of JAX; of an array of amplitudes that cannot be
     looked at the whole."""
     if not isinstance(path[-1], int):
-        return _follow(task, path)
-    node = _follow(task, path[:-1])
+        return part_at(task, path)
+    node = part_at(task, path[:-1])
     return np.asarray(node)[..., path[-1]] if _is_scalar(node) and is_concrete(node) else node
 
 
@@ -421,7 +421,7 @@ def get_parameter(task: Any, name: str) -> Any:
         return task.muscle.base()[tuple(BASE).index(name)]
     if name in OFF and name not in paths_of(task):
         return 0.0
-    value = _follow(task, _path(task, name))
+    value = part_at(task, _path(task, name))
     return float(value) if isinstance(value, np.floating) else value
 
 
@@ -486,13 +486,13 @@ def _with_values(task: Any, values: dict[str, Any]) -> Any:
         path = _path(task, name)
         index = path[-1] if isinstance(path[-1], int) else None
         fields = path[:-1] if index is not None else path
-        node = _follow(task, fields)
+        node = part_at(task, fields)
         if index is not None:
             parts = [node[i] for i in range(len(node))]
             parts[index] = value
             value = _stack(parts)
         task = eqx.tree_at(
-            lambda t, f=fields: _follow(t, f), task, as_inexact(value), is_leaf=lambda x: x is None
+            lambda t, f=fields: part_at(t, f), task, as_inexact(value), is_leaf=lambda x: x is None
         )
     return task
 
@@ -510,7 +510,8 @@ def _same_dtype(parts: list[Any]) -> list[Any]:
     return [jax.numpy.asarray(p, dtype=dtype) for p in parts]
 
 
-def _follow(node: Any, fields: tuple) -> Any:
+def part_at(node: Any, fields: tuple) -> Any:
+    """What is at the end of a path of fields and positions."""
     for step in fields:
         node = node[step] if isinstance(step, int) else getattr(node, step)
     return node

@@ -16,7 +16,7 @@ from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import Muscle, Perturbation
-from jaxmuscle.model._parameters import USUALLY_FREE, paths_of, set_parameters
+from jaxmuscle.model._parameters import USUALLY_FREE, part_at, paths_of, set_parameters
 from jaxmuscle.model._signals import AbstractSignal, Constant, SmoothStep
 from jaxmuscle.model._tasks import AbstractTask, State
 from jaxmuscle.spectra._settings import WINDOW
@@ -68,7 +68,7 @@ def linearise(task: AbstractTask, time: Scalar | float = HOLD) -> Linearisation:
         check_inputs(task)
     system = linearisation(task, time)
     check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
-    return system
+    return jax.tree.map(jnp.asarray, system)
 
 
 def _linearise(task: AbstractTask, time: Scalar | float = HOLD) -> Linearisation:
@@ -273,11 +273,7 @@ class Mechanics:
             if about[0] == "harmonic":
                 common["harmonic"] = self.task.harmonic
             else:
-                common["noise"] = functools.reduce(
-                    lambda x, step: x[step] if isinstance(step, int) else getattr(x, step),
-                    about[1:],
-                    self.task.noise,
-                )
+                common["noise"] = part_at(self.task, about)
             found = as_arrays(LinearTask(point.system, **common))
             own = {path: name for name, path in paths_of(found).items()}
             rows = [("", i) for i in self.place]  # by the operating point, not by name

@@ -591,10 +591,10 @@ def _variation_sd(
     parts: Chain, given: Any, line: Any, samples: Any, sampling: tuple[str, int]
 ) -> Array:
     """`log_variation_sd` of those parts that count, 1 or 0 for each."""
-    (counts, spread, interval), (kind, lags) = given, sampling
+    (counts, spread, interval), (swing, turns), (kind, lags) = given, line, sampling
     each = autocovariance(parts, interval, lags, kind, 0.0)
     r, slow = counts @ each.lagged(lags), counts @ each.mean_variance(samples)
-    return log_variation_sd(r, spread, slow, *line, samples)
+    return log_variation_sd(r, spread, slow, swing, turns, samples)
 
 
 @functools.cache
