@@ -56,8 +56,9 @@ from ._transfer import SignalSystem, harmonic_system, transfer
 
 MANY = 512
 BLOCK, FEW, ROWS = 32, 8, 512
-FURTHER = 4  # states of a filter and of an activation behind those of a task
-CHANNELS = 2  # of a part; more than these are parts of their own
+# Sizes of the large program: states behind those of a task, and channels. A filter alone; a filter
+# and an activation. What has more channels is parts of their own.
+SIZES = ((2, 4), (4, 2))
 LEAST_LAGS, LEAST_BINS = 512, 32
 
 
@@ -122,16 +123,22 @@ def _parts_of(
     place: Int[Array | np.ndarray, " moving"],
     values: Float[Array | np.ndarray, "points names"],
     near: Near,
-) -> tuple[Chain, Chain]:
-    """The parts of a noise that is alone in its task, with each row of values, and their slopes.
-    `place`: where the mechanical values are."""
-    size = len(task.system.A) + FURTHER
+) -> tuple[Any, Any]:
+    """The parts of a noise that is alone in its task, of each size (or nothing), with each row of
+    values, and their slopes. `place`: where the mechanical values are."""
+    states = len(task.system.A)
+    limits = [0, *(states + more for more, _ in SIZES[:-1]), np.inf]
 
     def one(values, near):
         def parts(values):
             point = near.at(values[place])
             (whole,) = chains(_with_values(task, names, values, point), point.balanced)
-            return stacked([few for part in whole for few in part.split(CHANNELS)], size, CHANNELS)
+            found = []
+            for i, (more, channels) in enumerate(SIZES):
+                own = [x for x in whole if limits[i] < max(len(x.matrix), 1) <= limits[i + 1]]
+                few = [x for part in own for x in part.split(channels)]
+                found.append(stacked(few, states + more, channels) if few else ())
+            return tuple(found)
 
         return value_and_slopes(parts, values)
 
@@ -416,12 +423,22 @@ class _Many(NamedTuple):
         each = [
             self._run(_parts_of, here, ("noise", *place), whole, near) for place in here.components
         ]
-        parts, slopes = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *each)
+        groups = []
+        for size in range(len(SIZES)):
+            own = [(i, x[size], by[size]) for i, (x, by) in enumerate(each) if x[size] != ()]
+            if own:
+                component = [[i] * x.matrix.shape[1] for i, x, _ in own]
+                found = [(x, by) for _, x, by in own]
+                groups.append(
+                    _Group(
+                        np.concatenate(component),
+                        *jax.tree.map(lambda *x: np.concatenate(x, axis=1), *found),
+                    )
+                )
         line = by_line = None
         if isinstance(self.task.harmonic.envelope, Constant):
             line, by_line = self._run(_line_of, here, ("harmonic",), whole, near)
-        component = np.repeat(np.arange(len(each)), [own.matrix.shape[1] for own, _ in each])
-        return _Seen(here, whole, near, columns, component, parts, slopes, line, by_line)
+        return _Seen(here, whole, near, columns, groups, line, by_line)
 
     def _run(
         self, program: Any, here: Mechanics, about: tuple, whole: np.ndarray, near: Near
@@ -472,9 +489,8 @@ class _Many(NamedTuple):
     def noise(self, seen: "_Seen") -> tuple[Any, ...]:
         """Power and variance of all noise, their slopes, and power of every resonance with its
         slopes."""
-        settings, parts = self.sampled.settings, len(seen.component)
+        settings = self.sampled.settings
         long = settings.length > LONG
-        rows = _Rows.of(seen.by_parts, parts)
         program = functools.partial(
             _noise_rows,
             operator=settings if long else as_arrays(_padded_operator(settings)),
@@ -483,17 +499,16 @@ class _Many(NamedTuple):
             samples=self.sampled.samples,
             recorded=self.sampled.recorded,
         )
-        (power, variance), (along, rise) = rows.run(program, seen.parts, seen.by_parts)
-        bins, columns, first = len(settings.frequency), len(self.along), rows.first()
-        power, variance = power[:, first, :bins], variance[:, first]
-        by_power = rows.spread(along[..., :bins], parts, columns)
-        by_variance = rows.spread(rise, parts, columns)
-        components = self.task.noise.components
+        each = [group.run(program, len(settings.frequency)) for group in seen.groups]
+        power, by_power, variance, by_variance = (
+            np.concatenate(x, axis=1) for x in zip(*each, strict=True)
+        )
+        component = np.concatenate([group.component for group in seen.groups])
         resonant, by_resonant = (
             tuple(
-                np.sum(x[:, seen.component == i], axis=1)
-                for i, each in enumerate(components)
-                if isinstance(each, ResonantNoise)
+                np.sum(x[:, component == i], axis=1)
+                for i, noise in enumerate(self.task.noise.components)
+                if isinstance(noise, ResonantNoise)
             )
             for x in (power, by_power)
         )
@@ -548,26 +563,65 @@ class _Many(NamedTuple):
         return line, swing, by_line, by_swing
 
 
+class _Group(NamedTuple):
+    """Parts of the noise of one size, with the component that each belongs to, and their slopes."""
+
+    component: Int[np.ndarray, " parts"]
+    parts: Chain
+    slopes: Chain
+
+    def run(self, program: Any, bins: int) -> tuple[np.ndarray, ...]:
+        """Power in the bins, its slopes, variance and its slopes, of each point and part."""
+        count, columns = len(self.component), self.slopes.matrix.shape[-1]
+        rows = _Rows.of(self.slopes, count)
+        (power, variance), (along, rise) = rows.run(program, self.parts, self.slopes)
+        first = rows.first()
+        return (
+            power[:, first, :bins],
+            rows.spread(along[..., :bins], count, columns),
+            variance[:, first],
+            rows.spread(rise, count, columns),
+        )
+
+    def alone(self, size: int, channels: int) -> Chain:
+        """Of a single point, filled up as `Chain.filled` does."""
+        matrix, white, rows = (np.asarray(x)[0] for x in self.parts)
+        more, fewer = size - matrix.shape[-1], channels - rows.shape[1]
+        whole = np.zeros((len(matrix), size, size)) - DECAY * np.eye(size)
+        whole[:, : size - more, : size - more] = matrix
+        return Chain(
+            whole,
+            np.pad(white, ((0, 0), (0, more), (0, 0))),
+            np.pad(rows, ((0, 0), (0, fewer), (0, more))),
+        )
+
+
 class _Seen(NamedTuple):
     """What is known of some rows: values of all names, operating points, where the asked columns
-    are; the parts of the noise, which component each belongs to, and the line, with slopes."""
+    are; the parts of the noise, and the line with its slopes."""
 
     here: Mechanics
     whole: np.ndarray
     near: Near
     columns: np.ndarray
-    component: Int[np.ndarray, " parts"]
-    parts: Chain
-    by_parts: Chain
+    groups: list[_Group]
     line: _Line | None
     by_line: _Line | None
+
+    def alone(self) -> Chain:
+        """All parts of a single point in one shape."""
+        parts = [group.parts for group in self.groups]
+        size = max(x.matrix.shape[-1] for x in parts)
+        channels = max(x.rows.shape[2] for x in parts)
+        each = [group.alone(size, channels) for group in self.groups]
+        return jax.tree.map(lambda *x: np.concatenate(x), *each)
 
 
 def noise_parts(task: AbstractTask) -> tuple[Chain, Int[np.ndarray, " parts"]]:
     """The parts of a task's noise along a leading axis, and which component each belongs to."""
     many = _Many(task, (), (), Sampled(task.settings, WINDOW, 0, 0.0))
     seen = many.seen(np.zeros((1, 0)))
-    return jax.tree.map(lambda x: x[0], seen.parts), seen.component
+    return seen.alone(), np.concatenate([group.component for group in seen.groups])
 
 
 def variation_sd_of_numbers(task: AbstractTask, sampled: Sampled, lags: int) -> Array:
@@ -576,9 +630,10 @@ def variation_sd_of_numbers(task: AbstractTask, sampled: Sampled, lags: int) -> 
     many, settings = _Many(task, (), (), sampled), sampled.settings
     seen = many.seen(np.zeros((1, 0)))
     swing = many.line(seen)[1][0]
-    parts = len(seen.component)
-    every = np.arange(-(-parts // 4) * 4)  # a program for 4, 8 ...
-    rows = jax.tree.map(lambda x: x[0, np.minimum(every, parts - 1)], seen.parts)
+    alone = seen.alone()
+    parts = len(alone.matrix)
+    every = np.arange(-(-parts // 8) * 8)  # a program for 8, 16 ...
+    rows = as_arrays(jax.tree.map(lambda x: x[np.minimum(every, parts - 1)], alone))
     given = every < parts, low_pass_spread(settings), 1 / settings.rate
     line = swing, task.harmonic.frequency / settings.rate
     sampling = settings.sampling, lags
