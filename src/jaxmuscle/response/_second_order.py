@@ -22,7 +22,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.model._white_noise import BandLimitedNoise, WhiteNoise
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
-from ._equilibrium import HOLD, without_settings
+from ._equilibrium import HOLD, mechanics, without_settings
 from ._expected import Moments, covariance_operator, expected_powers, lags_of
 from ._expected_moments import expected_moments
 from ._harmonic_line import LONG
@@ -238,7 +238,7 @@ def _second_order(
     with jax.enable_x64(True):
         system = linearisation(task)
         moments = expected_moments(task, settings, WINDOW)[0] if moments is None else moments
-        hessians, system = jax.tree.map(np.asarray, (_hessians(task, system), system))
+        hessians, system = jax.tree.map(np.asarray, (_hessians(mechanics(task), system), system))
     n = len(system.A)
     matrix, white, inputs = _inputs_of(parts, (*parts.noises, parts.harmonic), n)
     matrix[:n, :n] = system.A
