@@ -18,7 +18,7 @@ from ._autocovariance import autocovariances
 from ._expected import Moments, log_variation_sd, low_pass_spread, response
 from ._harmonic_line import harmonic_line
 from ._linearised import Linearisation, linearise
-from ._rows import Sampled, moments_of_rows, variation_sd_of_numbers
+from ._rows import Sampled, low_pass_of, moments_of_rows, variation_sd_of_numbers
 
 _response = kept(response)  # compiled apart, so that it is traced once
 
@@ -45,7 +45,7 @@ def variation_sd(
 ) -> Float[Array, ""]:
     """`log_variation_sd` of a task's output, by a program for at `most` so many samples: trials are
     rarely of one length."""
-    lags = most + len(low_pass_spread(settings)) // 2
+    lags = most + len(low_pass_of(settings)) // 2
     if all_concrete((task, samples)):
         return variation_sd_of_numbers(task, Sampled(settings, WINDOW, samples, 0.0), lags)
     return _variation_sd(as_arrays(task), settings, samples, lags)

@@ -107,7 +107,7 @@ class LinearTask(AbstractTask):
         return cls(linearise(task) if system is None else system, **task.common)
 
     def initial_state(self) -> State:
-        return self.system.point
+        return jnp.asarray(self.system.point)
 
     def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
         s, away = self.system, [y[i] - self.system.point[i] for i in range(len(self.system.A))]

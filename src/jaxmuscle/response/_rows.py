@@ -490,10 +490,9 @@ class _Many(NamedTuple):
         """Power and variance of all noise, their slopes, and power of every resonance with its
         slopes."""
         settings = self.sampled.settings
-        long = settings.length > LONG
         program = functools.partial(
             _noise_rows,
-            operator=settings if long else as_arrays(_padded_operator(settings)),
+            operator=as_arrays(_arrays_of(settings, self.sampled.window)[0]),
             interval=as_arrays(1 / settings.rate),
             sampling=settings.sampling,
             samples=self.sampled.samples,
@@ -522,11 +521,7 @@ class _Many(NamedTuple):
             return self._enveloped(seen)
         settings, frequency = self.sampled.settings, np.asarray(line.frequency)
         different, back = np.unique(frequency, return_inverse=True)
-        segments = (
-            (settings, self.sampled.window)
-            if settings.length > LONG
-            else as_arrays(_padded_segments(settings, self.sampled.window))
-        )
+        segments = as_arrays(_arrays_of(settings, self.sampled.window)[1])
         tables = [
             jax.tree.map(
                 lambda x, n=count: np.asarray(x)[:n],
@@ -634,7 +629,7 @@ def variation_sd_of_numbers(task: AbstractTask, sampled: Sampled, lags: int) -> 
     parts = len(alone.matrix)
     every = np.arange(-(-parts // 8) * 8)  # a program for 8, 16 ...
     rows = as_arrays(jax.tree.map(lambda x: x[np.minimum(every, parts - 1)], alone))
-    given = every < parts, low_pass_spread(settings), 1 / settings.rate
+    given = every < parts, low_pass_of(settings), 1 / settings.rate
     line = swing, task.harmonic.frequency / settings.rate
     sampling = settings.sampling, lags
     given, line = as_arrays((given, line))
@@ -653,6 +648,36 @@ def _variation_sd(
 
 
 @functools.cache
+def _arrays_of(
+    settings: SpectrumSettings, window: tuple[float, float]
+) -> tuple[Any, Any, np.ndarray]:
+    """What programs take of some settings, as arrays: `padded_operator`, `padded_segments` (or the
+    settings themselves of long segments) and `low_pass_spread`."""
+    with jax.enable_x64(True):
+        *shapes, spread = jax.tree.map(np.asarray, _kept_arrays(settings, window))
+    if settings.length > LONG:
+        return settings, (settings, window), spread
+    return *shapes, spread
+
+
+def low_pass_of(settings: SpectrumSettings) -> Float[np.ndarray, " lags"]:
+    """`low_pass_spread`."""
+    return _arrays_of(settings, WINDOW)[2]
+
+
+@kept
+def _kept_arrays(settings: SpectrumSettings, window: tuple[float, float]) -> tuple[Any, ...]:
+    """Kept, since to make them takes scipy.signal, half a second to import."""
+    if settings.length > LONG:
+        return (jnp.asarray(low_pass_spread(settings)),)
+    found = (
+        _padded_operator(settings),
+        _padded_segments(settings, window),
+        low_pass_spread(settings),
+    )
+    return jax.tree.map(jnp.asarray, found)
+
+
 def _padded_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins_and_two lags"]:
     """`covariance_operator` in a shape that settings share: with bins of zeros, and lags that do
     not count."""
@@ -663,7 +688,6 @@ def _padded_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins_and_
     return found
 
 
-@functools.cache
 def _padded_segments(settings: SpectrumSettings, window: tuple[float, float]) -> Segments:
     """`segments_of` in a shape that settings share."""
     return segments_of(settings, window).filled(

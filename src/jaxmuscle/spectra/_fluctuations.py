@@ -16,7 +16,7 @@ BANDS = {f"band_{low:g}_{high:g}": (low, high) for low, high in itertools.pairwi
 GROWTH, WINDOWS = 1.2, 10  # of one window over the last; how many of the largest
 
 
-def in_bands(frequency: Any, resolution: float) -> Any:
+def in_bands(frequency: Any, resolution: Any) -> Any:
     """How much of each bin lies in each band, from 0 to 1: a bin holds what is up to half the
     resolution away from it."""
     kind = np if isinstance(frequency, np.ndarray) else jnp
