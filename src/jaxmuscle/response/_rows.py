@@ -521,7 +521,8 @@ class _Many(NamedTuple):
             return self._enveloped(seen)
         settings, frequency = self.sampled.settings, np.asarray(line.frequency)
         different, back = np.unique(frequency, return_inverse=True)
-        segments = as_arrays(_arrays_of(settings, self.sampled.window)[1])
+        segments = _arrays_of(settings, self.sampled.window)[1]
+        segments = as_arrays(segments) if isinstance(segments, Segments) else segments
         tables = [
             jax.tree.map(
                 lambda x, n=count: np.asarray(x)[:n],
