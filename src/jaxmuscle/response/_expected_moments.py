@@ -36,7 +36,8 @@ def expected_moments(
         return _response(as_arrays(task), settings, window, samples, as_arrays(recorded))
     sampled = Sampled(settings, window, samples, recorded)
     moments, _, system = moments_of_rows(task, (), np.zeros((1, 0)), sampled)
-    with jax.debug_nans(False):  # a sign here: no equilibrium
+    # numbers also while something else is traced; NaN is a sign here: no equilibrium
+    with jax.ensure_compile_time_eval(), jax.debug_nans(False):
         return jax.tree.map(lambda x: jnp.asarray(x[0]), (moments, system))
 
 

@@ -57,7 +57,7 @@ def _low_pass(segments: "Segments", turn: Complex[Array, ""]) -> Complex[Array, 
     back = jnp.stack([jnp.ones_like(turn), 1 / turn, 1 / turn**2])
     sections = jnp.asarray(segments.sections, turn.dtype)
     gain = jnp.prod((sections[:, :3] @ back) / (sections[:, 3:] @ back))
-    return jnp.where(jnp.asarray(segments.both) > 0, gain * jnp.conj(gain), gain)
+    return jnp.where(segments.both > 0, gain * jnp.conj(gain), gain)
 
 
 def _sampled(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:

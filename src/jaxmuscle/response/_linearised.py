@@ -68,7 +68,7 @@ def linearise(task: AbstractTask, time: Scalar | float = HOLD) -> Linearisation:
         check_inputs(task)
     system = linearisation(task, time)
     check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
-    return jax.tree.map(jnp.asarray, system)
+    return system
 
 
 def _linearise(task: AbstractTask, time: Scalar | float = HOLD) -> Linearisation:
@@ -338,8 +338,10 @@ def linearisation(task: AbstractTask, time: float = HOLD) -> Linearisation:
     """`linearise` without checks; of a task of numbers by the program that fits use."""
     if isinstance(task, LinearTask) or not all_concrete(task):
         return _linearise(task, time)
-    mechanics_of = Mechanics.of(task)
-    return jax.tree.map(lambda x: x[0], mechanics_of.at(np.zeros((1, 0)), time)[1].point.system)
+    found = Mechanics.of(task).at(np.zeros((1, 0)), time)[1].point.system
+    # numbers also while something else is traced; NaN is a sign here: no equilibrium
+    with jax.ensure_compile_time_eval(), jax.debug_nans(False):
+        return jax.tree.map(lambda x: jnp.asarray(x[0]), found)
 
 
 def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
