@@ -129,7 +129,7 @@ def _sum(row: Array, values: Any) -> Array:
     return functools.reduce(operator.add, (row[i] * values[i] for i in range(len(row))))
 
 
-POINTS, LATEST = 32, 8
+POINTS, LATEST = 32, 8  # points of a program; tasks that are kept prepared
 # free with a known mean force, with a moved insertion and in designs
 SOMETIMES = ("P_w", "m_w", "m_z")
 NOT_MECHANICAL = ("noise", "harmonic", "activation")

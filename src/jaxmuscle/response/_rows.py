@@ -54,8 +54,10 @@ from ._linearised import (
 )
 from ._transfer import SignalSystem, harmonic_system, transfer
 
-MANY = 512
-BLOCK, FEW, ROWS = 32, 8, 512
+MANY = 512  # points that are held at once
+# Rows of a call; of a block, enough for vectors, few enough that a call for one point is short; of
+# a block of lines, whose frequencies are few.
+ROWS, BLOCK, FEW = 512, 32, 8
 # Sizes of the large program: states behind those of a task, and channels. A filter alone; a filter
 # and an activation. What has more channels is parts of their own.
 SIZES = ((2, 4), (4, 2))
@@ -362,8 +364,8 @@ class _Rows(NamedTuple):
         return cls(np.arange(parts), np.full(parts, -1))
 
     def run(self, program: Callable[..., Any], given: Any, slopes: Any) -> tuple[Any, Any]:
-        """The program's results for every point and part, summed over nothing, and their slopes
-        along a last axis."""
+        """The program's results for every point and row, and their slopes in the rows'
+        directions."""
         points = len(jax.tree.leaves(given)[0])
         rows = jax.tree.map(lambda x: _flat(np.asarray(x)[:, self.part]), given)
         towards = jax.tree.map(lambda x: _flat(self._directions(np.asarray(x))), slopes)
@@ -579,17 +581,15 @@ class _Group(NamedTuple):
             rows.spread(rise, count, columns),
         )
 
-    def alone(self, size: int, channels: int) -> Chain:
-        """Of a single point, filled up as `Chain.filled` does."""
+    def alone(self, size: int, channels: int) -> Any:
+        """Of a single point a `Chain` of numbers, filled up as `Chain.filled` does."""
         matrix, white, rows = (np.asarray(x)[0] for x in self.parts)
         more, fewer = size - matrix.shape[-1], channels - rows.shape[1]
         whole = np.zeros((len(matrix), size, size)) - DECAY * np.eye(size)
         whole[:, : size - more, : size - more] = matrix
-        return Chain(
-            whole,
-            np.pad(white, ((0, 0), (0, more), (0, 0))),
-            np.pad(rows, ((0, 0), (0, fewer), (0, more))),
-        )
+        white = np.pad(white, ((0, 0), (0, more), (0, 0)))
+        rows = np.pad(rows, ((0, 0), (0, fewer), (0, more)))
+        return self.parts._replace(matrix=whole, white=white, rows=rows)
 
 
 class _Seen(NamedTuple):
