@@ -293,15 +293,16 @@ def peak_frequency(
     """Frequency [Hz] of the highest peak of a spectrum; differentiable, also in `jit` and `vmap`.
 
         spectrum = jm.expected_spectrum(jm.Isometric())
-        jm.spectra.peak_frequency(spectrum, 2.0, 6.0)
+        jm.spectra.peak_frequency(spectrum, 3.0, 6.0)  # the harmonic
 
         f_k + Δf (l_{k-1} - l_{k+1}) / (2 (l_{k-1} - 2 l_k + l_{k+1}))
 
     is the vertex of the parabola through the log power l of the largest bin k and its neighbours,
     at most half a bin away. Where k is the first or the last bin, where a neighbour is larger (the
     largest bin between `low` and `high` then lies at one end, and its peak beyond), and where a
-    power of the three is 0, it is f_k itself, whose derivative is 0. The choice of k is not
-    differentiated: where two bins are equal the frequency jumps.
+    power of the three is 0, it is f_k itself, whose derivative is 0: then look between closer ends.
+    The choice of k is not differentiated: where two bins are equal the frequency jumps. So it is a
+    number to state, and no target to train on: for that take the log powers.
 
     **Arguments:** `spectrum`, a `Spectrum`, or a pair of frequencies [Hz] (bins,) and power
     (..., bins) in any unit; `low` and `high` [Hz]: only bins between them are looked at, ends
