@@ -22,7 +22,7 @@ TARGET = "vastus-lateralis-26mvc"
 # from outside the model: filtered noise, and a spring, a damper and a mass that a motor moves.
 FIRST: dict[str, tuple[str, list[str], float]] = {
     "own spectrum, richer models": ("hilly.csv", [], 14.5),
-    "own spectrum, base model": ("slow.csv", ["--noise", "ou"], 7.0),
+    "own spectrum, base model": ("slow.csv", ["--noise", "ornstein-uhlenbeck"], 7.0),
     "moved record": ("moved.csv", ["--task", "prescribed-length"], 20.0),
 }
 RATE, COUNT = 100.0, 6000
