@@ -12,7 +12,7 @@ from processes import ended, true_python
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.response._expected import response
-from jaxmuscle.response._rows import Sampled, moments_of_rows
+from jaxmuscle.response._rows import Sampling, moments_of_rows
 
 WINDOW = (4.0, 20.0)
 TREMOR = jm.ResonantNoise(0.006, frequency=9.0, width=1.5)
@@ -37,6 +37,9 @@ TASKS = {
         noise=jm.BandLimitedNoise(shared=True), activation=jm.Activation(0.06)
     ),
     "pink": jm.PrescribedLength(noise=jm.PinkNoise(0.02), harmonic=jm.Harmonic(0.01, 5.3)),
+    "enveloped": jm.Isometric(
+        harmonic=jm.Harmonic(0.02, 5.3, envelope=jm.model.Decay(1.0, start=6.0, final=0.3))
+    ),
     "motion": jm.PrescribedMotion(noise=jm.BandLimitedNoise() + TREMOR, F_ext=10.0),
 }
 
@@ -48,6 +51,7 @@ TASKS = {
         ("all parts", "instant"),
         ("shared", "average"),
         ("pink", "filtered"),
+        ("enveloped", "instant"),
         pytest.param("motion", "long", marks=pytest.mark.slow),
         pytest.param("all parts", "long", marks=pytest.mark.slow),
         pytest.param("pink", "average", marks=pytest.mark.slow),
@@ -58,7 +62,7 @@ def test_moments_and_slopes_are_those_of_one_program(x64, name, kind):
     task, settings = TASKS[name], SETTINGS[kind]
     own = tuple(n for n in OWN if n in task.parameter_names)
     values = np.array([float(task[n]) for n in own]) * np.array([[1.0], [1.03]])
-    sampled = Sampled(settings, WINDOW, 1500, 0.001)
+    sampled = Sampling(settings, WINDOW, 1500, 0.001)
     found, slopes, _ = moments_of_rows(task, own, values, sampled)
 
     def whole(at):
@@ -79,7 +83,7 @@ def test_moments_and_slopes_are_those_of_one_program(x64, name, kind):
 def test_slopes_along_some_of_what_is_given_or_none(x64):
     task, own = TASKS["all parts"], ("k_w", "activation_time", "resonance_frequency")
     values = np.array([[float(task[n]) for n in own]] * 3) * np.array([[1.0], [1.1], [0.9]])
-    sampled = Sampled(SETTINGS["instant"], WINDOW, 1500, 0.0)
+    sampled = Sampling(SETTINGS["instant"], WINDOW, 1500, 0.0)
     all_values, slopes, _ = moments_of_rows(task, own, values, sampled)
     some_values, some, _ = moments_of_rows(task, own, values, sampled, along=own[2:])
     none_values, none, _ = moments_of_rows(task, own, values, sampled, along=())

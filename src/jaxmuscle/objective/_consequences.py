@@ -1,5 +1,6 @@
 """What follows from a point θ: moments and derived quantities with their slopes, residuals."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from jaxmuscle.model._parameters import paths_of, set_parameters
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.response._linearised import Near, value_and_slopes
+from jaxmuscle.response._linearised import Near, in_parts, value_and_slopes
 from jaxmuscle.response._rows import mechanical_rows
 from jaxmuscle.response._transfer import half_power_level
 
@@ -207,12 +208,11 @@ def _of_spectra(
     part: PartResiduals, seen: Expansion, known: dict[str, np.ndarray]
 ) -> tuple[tuple[np.ndarray, Any], tuple[np.ndarray, Any]]:
     """Data residuals and `of_spectrum` in every row, and their slopes with respect to θ: by a
-    program for `BATCH` rows, two resonances, and as many coordinates as fits share."""
+    program for two resonances and as many coordinates as fits share."""
     count, free = seen.theta.shape
     peaks = [
         known.get(f"{which}_frequency", np.zeros(count)) for which in ("resonance", "resonance_2")
     ]
-    last = np.minimum(np.arange(-(-count // BATCH) * BATCH), count - 1)
 
     def filled(moments: Moments, *shape: int) -> Moments:
         none = np.zeros((count, len(part.model.chosen), *shape))
@@ -223,18 +223,10 @@ def _of_spectra(
     slopes = jax.tree.map(
         lambda x: np.pad(x, [*[(0, 0)] * (np.ndim(x) - 1), (0, more)]), filled(seen.slopes, free)
     )
-    rows = jax.tree.map(
-        lambda x: np.asarray(x)[last], (filled(seen.moments), slopes, np.stack(peaks, axis=1))
-    )
     settings = part.task.settings
     given = as_arrays((settings.frequency[part.model.chosen], settings.resolution))
-    found = [
-        _spectra(
-            part.residual, part.data, *given, *jax.tree.map(lambda x, i=i: x[i : i + BATCH], rows)
-        )
-        for i in range(0, len(last), BATCH)
-    ]
-    values, slopes = jax.tree.map(lambda *x: np.concatenate(x)[:count], *found)
+    program = functools.partial(_spectra, part.residual, part.data, *given)
+    values, slopes = in_parts(program, filled(seen.moments), slopes, np.stack(peaks, axis=1))
     return values, jax.tree.map(lambda x: x[..., :free], slopes)
 
 

@@ -16,7 +16,7 @@ from jaxmuscle.response._expected import Moments, response
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._input_response import parts_of_stiffness
 from jaxmuscle.response._linearised import LinearTask, settled
-from jaxmuscle.response._rows import Sampled, moments_of_rows
+from jaxmuscle.response._rows import Sampling, moments_of_rows
 from jaxmuscle.simulation._batch import streams_of
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_rows
@@ -82,7 +82,7 @@ class Linear(eqx.Module):
         along: tuple[str, ...],
     ) -> tuple[Moments, Moments]:
         """The same with each row of values, and their slopes along a last axis."""
-        sampled = Sampled(task.settings, self.window, self.samples, self.recorded)
+        sampled = Sampling(task.settings, self.window, self.samples, self.recorded)
         points = None if self.points is None else np.asarray(self.points)
         moments, slopes, _ = moments_of_rows(task, own, values, sampled, points, along)
         slopes = self._chosen(

@@ -302,7 +302,7 @@ def _decimated(
     return r @ head.T + r[:, :KINK] @ more.T, later[..., 0]
 
 
-def autocovariance(
+def sampled_autocovariance(
     chain: Chain, interval: Scalar, lags: int, sampling: str, recorded: Scalar
 ) -> Autocovariance:
     """Autocovariance of the sampled output of parts along a leading axis, good for that many lags;
@@ -351,7 +351,7 @@ def autocovariances(
     """Of every independent part of the noise, along a leading axis; which component of the noise
     each belongs to."""
     parts = [(own, i) for i, each in enumerate(chains(task, balanced(system))) for own in each]
-    found = autocovariance(
+    found = sampled_autocovariance(
         stacked([own for own, _ in parts]), 1 / settings.rate, lags, settings.sampling, recorded
     )
     return found, [i for _, i in parts]

@@ -18,7 +18,7 @@ from ._autocovariance import autocovariances
 from ._expected import Moments, log_variation_sd, low_pass_spread, response
 from ._harmonic_line import harmonic_line
 from ._linearised import Linearisation, linearise
-from ._rows import Sampled, low_pass_of, moments_of_rows, variation_sd_of_numbers
+from ._rows import Sampling, low_pass_of, moments_of_rows, variation_sd_of_numbers
 
 _response = kept(response)  # compiled apart, so that it is traced once
 
@@ -34,7 +34,7 @@ def expected_moments(
     samples = samples_in(window, settings) if samples is None else samples
     if not all_concrete((task, samples, recorded)):
         return _response(as_arrays(task), settings, window, samples, as_arrays(recorded))
-    sampled = Sampled(settings, window, samples, recorded)
+    sampled = Sampling(settings, window, samples, recorded)
     moments, _, system = moments_of_rows(task, (), np.zeros((1, 0)), sampled)
     # numbers also while something else is traced; NaN is a sign here: no equilibrium
     with jax.ensure_compile_time_eval(), jax.debug_nans(False):
@@ -48,7 +48,7 @@ def variation_sd(
     rarely of one length."""
     lags = most + len(low_pass_of(settings)) // 2
     if all_concrete((task, samples)):
-        return variation_sd_of_numbers(task, Sampled(settings, WINDOW, samples, 0.0), lags)
+        return variation_sd_of_numbers(task, Sampling(settings, WINDOW, samples, 0.0), lags)
     return _variation_sd(as_arrays(task), settings, samples, lags)
 
 

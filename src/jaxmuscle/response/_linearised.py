@@ -211,7 +211,7 @@ def balanced(system: Linearisation) -> Linearisation:
     return system._replace(A=A, B=size * system.B / scale[:, None], C=system.C * scale / size)
 
 
-class Bearer(Muscle):
+class KnownBase(Muscle):
     """A muscle of which only the base coefficients are known: what noise and harmonic are fractions
     of."""
 
@@ -234,21 +234,18 @@ class Mechanics:
         self.defaults = np.array([float(task[name]) for name in self.names])
         self.columns = np.array([self.names.index(name) for name in own], dtype=int)
         self.bare, paths = mechanics(task), paths_of(task)
-        self.held = held_up(self.bare)
+        self.held = with_held_inputs(self.bare)
         place = [i for i, n in enumerate(self.names) if paths[n][0] not in NOT_MECHANICAL]
         self.place, self.moving = np.array(place, dtype=int), tuple(self.names[i] for i in place)
         self.seen: dict[float, tuple[np.ndarray, Near]] = {}
-        self._bearers: dict[tuple[Any, ...], Any] = {}
+        self._tasks_about: dict[tuple[Any, ...], Any] = {}
 
     @classmethod
     def of(cls, task: AbstractTask, own: Sequence[str] = ()) -> "Mechanics":
         """Of the latest tasks made only once: to prepare one takes longer than to linearise it."""
         for known in _LATEST:
-            if (known.task is task, known.own, known.dtype) == (
-                True,
-                tuple(own),
-                jnp.result_type(float),
-            ):
+            kind = known.own, known.dtype
+            if known.task is task and kind == (tuple(own), jnp.result_type(float)):
                 return known
         found = cls(task, tuple(own))
         _LATEST[:] = [found, *_LATEST[: LATEST - 1]]
@@ -262,13 +259,13 @@ class Mechanics:
             return [()]
         return [("parts", i) for i in range(len(noise.components))]
 
-    def bearer(self, about: tuple[Any, ...]) -> tuple[LinearTask, tuple[str, ...], np.ndarray]:
+    def task_about(self, about: tuple[Any, ...]) -> tuple[LinearTask, tuple[str, ...], np.ndarray]:
         """A task that has nothing but the activation and one component of the noise, or the
         harmonic, `about` which it is; what its values are called, and their columns: the mechanical
         ones first."""
-        if about not in self._bearers:
+        if about not in self._tasks_about:
             point = jax.tree.map(lambda x: x[0], next(iter(self.seen.values()))[1].point)
-            common: Any = self.bare.common | {"muscle": Bearer(coefficients=point.base)}
+            common: Any = self.bare.common | {"muscle": KnownBase(coefficients=point.base)}
             common["activation"] = self.task.activation
             if about[0] == "harmonic":
                 common["harmonic"] = self.task.harmonic
@@ -282,9 +279,9 @@ class Mechanics:
                 if path[0] == "activation" or path[: len(about)] == about:
                     kind = path if path[0] == "activation" else (about[0], *path[len(about) :])
                     rows.append((own[kind], i))
-            names, columns = zip(*[(name, i) for name, i in rows], strict=True)
-            self._bearers[about] = found, names, np.array(columns, dtype=int)
-        return self._bearers[about]
+            names, columns = zip(*rows, strict=True)
+            self._tasks_about[about] = found, names, np.array(columns, dtype=int)
+        return self._tasks_about[about]
 
     def at(
         self, values: Float[np.ndarray, "rows own"], time: float = HOLD
@@ -306,7 +303,7 @@ class Mechanics:
 _LATEST: list[Mechanics] = []
 
 
-def held_up(task: AbstractTask) -> AbstractTask:
+def with_held_inputs(task: AbstractTask) -> AbstractTask:
     """The task with steps that are over at `HOLD` as constants, and with the state from which its
     equilibrium is looked for: a program serves tasks with and without these."""
     parts: dict[str, Any] = {

@@ -24,7 +24,7 @@ from jaxmuscle.model._signals import Constant
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._settings import LONGEST, WINDOW, SpectrumSettings
 
-from ._autocovariance import DECAY, Chain, autocovariance, chains, stacked
+from ._autocovariance import DECAY, Chain, chains, sampled_autocovariance, stacked
 from ._expected import (
     Moments,
     covariance_operator,
@@ -64,7 +64,7 @@ SIZES = ((2, 4), (4, 2))
 LEAST_LAGS, LEAST_BINS = 512, 32
 
 
-class Sampled(NamedTuple):
+class Sampling(NamedTuple):
     """How moments are sampled: settings and window of the spectrum, number of samples of the
     recording whose variance it is, and the interval [s] at which it was recorded, as in
     `response`."""
@@ -79,7 +79,7 @@ def moments_of_rows(
     task: AbstractTask,
     own: Sequence[str],
     values: Float[np.ndarray, "rows own"],
-    sampled: Sampled,
+    sampled: Sampling,
     points: Float[np.ndarray, " points"] | None = None,
     along: Sequence[str] | None = None,
 ) -> tuple[Moments, Moments, Linearisation]:
@@ -110,7 +110,7 @@ class _Line(NamedTuple):
 def _with_values(
     task: LinearTask, names: tuple[str, ...], values: Array, point: Operating
 ) -> AbstractTask:
-    """The bearer with these values of noise, harmonic and activation, and base coefficients."""
+    """The task with these values of noise, harmonic and activation, and base coefficients."""
     own = task.parameter_names
     return set_parameters(
         eqx.tree_at(lambda t: t.muscle.coefficients, task, point.base),
@@ -118,60 +118,67 @@ def _with_values(
     )
 
 
+def _of_values(function: Callable[[Any, Any], Any], given: Any, values: Any, near: Near) -> Any:
+    """`function(task, balanced system)` of a task with each row of values, the mechanical ones
+    first, and its slopes. `given`: the task and the names of the values."""
+
+    task, names = given
+
+    def one(values, near):
+        def at(values):
+            point = near.at(values[: len(near.values)])
+            return function(_with_values(task, names, values, point), point.balanced)
+
+        return value_and_slopes(at, values)
+
+    return jax.vmap(one)(values, near)
+
+
 @kept
-def _parts_of(
-    task: LinearTask,
-    names: tuple[str, ...],
-    place: Int[Array | np.ndarray, " moving"],
-    values: Float[Array | np.ndarray, "points names"],
-    near: Near,
-) -> tuple[Any, Any]:
-    """The parts of a noise that is alone in its task, of each size (or nothing), with each row of
-    values, and their slopes. `place`: where the mechanical values are."""
-    states = len(task.system.A)
+def _parts_of(given: tuple[LinearTask, tuple[str, ...]], values: Any, near: Near) -> Any:
+    """The parts of a noise that is alone in its task, of each size (or nothing): `_of_values`."""
+    states = len(given[0].system.A)
     limits = [0, *(states + more for more, _ in SIZES[:-1]), np.inf]
 
-    def one(values, near):
-        def parts(values):
-            point = near.at(values[place])
-            (whole,) = chains(_with_values(task, names, values, point), point.balanced)
-            found = []
-            for i, (more, channels) in enumerate(SIZES):
-                own = [x for x in whole if limits[i] < max(len(x.matrix), 1) <= limits[i + 1]]
-                few = [x for part in own for x in part.split(channels)]
-                found.append(stacked(few, states + more, channels) if few else ())
-            return tuple(found)
+    def parts(there, system):
+        (whole,) = chains(there, system)
+        found = []
+        for i, (more, channels) in enumerate(SIZES):
+            own = [x for x in whole if limits[i] < max(len(x.matrix), 1) <= limits[i + 1]]
+            few = [x for part in own for x in part.split(channels)]
+            found.append(stacked(few, states + more, channels) if few else ())
+        return tuple(found)
 
-        return value_and_slopes(parts, values)
-
-    return jax.vmap(one)(values, near)
+    return _of_values(parts, given, values, near)
 
 
 @kept
-def _line_of(
-    task: LinearTask,
-    names: tuple[str, ...],
-    place: Int[Array | np.ndarray, " moving"],
-    values: Float[Array | np.ndarray, "points names"],
+def _line_of(given: tuple[LinearTask, tuple[str, ...]], values: Any, near: Near) -> Any:
+    """The line of a task: `_of_values`."""
+    size = len(given[0].system.A) + 2  # with the states of an activation
+
+    def line(there, system):
+        reply = harmonic_size(there, system.A.dtype)
+        return _Line(
+            _filled(harmonic_system(there, system), size),
+            jnp.stack([jnp.real(reply), jnp.imag(reply)]),
+            jnp.asarray(there.harmonic.frequency, system.A.dtype),
+        )
+
+    return _of_values(line, given, values, near)
+
+
+@kept
+def _enveloped(
+    sampled: tuple[SpectrumSettings, tuple[float, float]],
+    given: tuple[LinearTask, tuple[str, ...]],
+    values: Any,
     near: Near,
-) -> tuple[_Line, _Line]:
-    """The line of a task with each row of values, and its slopes."""
-    size = len(task.system.A) + 2
-
-    def one(values, near):
-        def line(values):
-            point = near.at(values[place])
-            there, system = _with_values(task, names, values, point), point.balanced
-            reply = harmonic_size(there, system.A.dtype)
-            return _Line(
-                _filled(harmonic_system(there, system), size),
-                jnp.stack([jnp.real(reply), jnp.imag(reply)]),
-                jnp.asarray(there.harmonic.frequency, system.A.dtype),
-            )
-
-        return value_and_slopes(line, values)
-
-    return jax.vmap(one)(values, near)
+) -> Any:
+    """`harmonic_line` under an envelope that moves: `_of_values`."""
+    return _of_values(
+        lambda there, system: harmonic_line(there, system, *sampled, 1), given, values, near
+    )
 
 
 def _filled(system: SignalSystem, size: int) -> SignalSystem:
@@ -180,29 +187,6 @@ def _filled(system: SignalSystem, size: int) -> SignalSystem:
     idle = -DECAY * jnp.eye(more, dtype=system.A.dtype)
     A = jax.scipy.linalg.block_diag(system.A, idle)
     return SignalSystem(A, jnp.pad(system.b, (0, more)), jnp.pad(system.c, (0, more)), *system[3:])
-
-
-@kept
-def _enveloped(
-    task: LinearTask,
-    names: tuple[str, ...],
-    place: Int[Array | np.ndarray, " moving"],
-    sampled: tuple[SpectrumSettings, tuple[float, float]],
-    values: Float[Array | np.ndarray, "points names"],
-    near: Near,
-) -> tuple[Any, Any]:
-    """`harmonic_line` under an envelope that moves."""
-
-    def one(values, near):
-        def line(values):
-            point = near.at(values[place])
-            return harmonic_line(
-                _with_values(task, names, values, point), point.balanced, *sampled, 1
-            )
-
-        return value_and_slopes(line, values)
-
-    return jax.lax.map(lambda row: one(*row), (values, near))
 
 
 @kept
@@ -263,7 +247,7 @@ def _noise_rows(
     lags = lags_of(operator) if isinstance(operator, SpectrumSettings) else operator.shape[1]
 
     def spectrum(parts):
-        each = autocovariance(parts, interval, max(lags, LONGEST), sampling, recorded)
+        each = sampled_autocovariance(parts, interval, max(lags, LONGEST), sampling, recorded)
         r = each.lagged(lags)
         if isinstance(operator, SpectrumSettings):
             found = jax.lax.map(functools.partial(expected_powers, operator), r)
@@ -369,17 +353,8 @@ class _Rows(NamedTuple):
         points = len(jax.tree.leaves(given)[0])
         rows = jax.tree.map(lambda x: _flat(np.asarray(x)[:, self.part]), given)
         towards = jax.tree.map(lambda x: _flat(self._directions(np.asarray(x))), slopes)
-        whole = points * len(self.part)
-        found = []
-        for i in range(0, whole, ROWS):
-            count = min(ROWS, whole - i)
-            cut = functools.partial(_cut, begin=i, count=count)
-            made = program(jax.tree.map(cut, rows), jax.tree.map(cut, towards), np.asarray(count))
-            found.append(jax.tree.map(lambda x, count=count: np.asarray(x)[:count], made))
-        values, along = jax.tree.map(
-            lambda *x: np.concatenate(x).reshape(points, len(self.part), *x[0].shape[1:]), *found
-        )
-        return values, along
+        found = _in_calls(program, rows, towards)
+        return jax.tree.map(lambda x: x.reshape(points, len(self.part), *x.shape[1:]), found)
 
     def _directions(self, slopes: np.ndarray) -> np.ndarray:
         if not slopes.shape[-1]:
@@ -402,11 +377,20 @@ def _flat(x: np.ndarray) -> np.ndarray:
     return x.reshape(-1, *x.shape[2:])
 
 
-def _cut(x: np.ndarray, begin: int, count: int) -> np.ndarray:
-    """So many rows in the shape of all that a program takes."""
-    whole = np.zeros((ROWS, *x.shape[1:]), x.dtype)
-    whole[:count] = x[begin : begin + count]
-    return whole
+def _in_calls(program: Callable[..., Any], *rows: Any) -> Any:
+    """What a program for `ROWS` rows makes of any number of them; it is told how many count."""
+    whole, found = len(jax.tree.leaves(rows)[0]), []
+    for i in range(0, whole, ROWS):
+        count = min(ROWS, whole - i)
+
+        def cut(x: np.ndarray, i: int = i, count: int = count) -> np.ndarray:
+            filled = np.zeros((ROWS, *x.shape[1:]), x.dtype)
+            filled[:count] = x[i : i + count]
+            return filled
+
+        made = program(*jax.tree.map(cut, rows), np.asarray(count))
+        found.append(jax.tree.map(lambda x, count=count: np.asarray(x)[:count], made))
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 
 class _Many(NamedTuple):
@@ -415,13 +399,12 @@ class _Many(NamedTuple):
     task: AbstractTask
     own: tuple[str, ...]
     along: tuple[str, ...]
-    sampled: Sampled
+    sampled: Sampling
 
     def seen(self, values: np.ndarray) -> "_Seen":
         """At some rows."""
         here = Mechanics.of(self.task, self.own)
         whole, near = here.at(values)
-        columns = np.array([here.names.index(name) for name in self.along], dtype=int)
         each = [
             self._run(_parts_of, here, ("noise", *place), whole, near) for place in here.components
         ]
@@ -440,19 +423,15 @@ class _Many(NamedTuple):
         line = by_line = None
         if isinstance(self.task.harmonic.envelope, Constant):
             line, by_line = self._run(_line_of, here, ("harmonic",), whole, near)
-        return _Seen(here, whole, near, columns, groups, line, by_line)
+        return _Seen(here, whole, near, groups, line, by_line)
 
     def _run(
         self, program: Any, here: Mechanics, about: tuple, whole: np.ndarray, near: Near
     ) -> tuple[Any, Any]:
         """A program about one component, and its slopes along one's own."""
-        task, names, columns = here.bearer(about)
-        place = np.arange(len(here.place))
-        found, slopes = in_parts(
-            functools.partial(program, task, names, place), whole[:, columns], near
-        )
-        asked = [here.names[i] for i in columns]
-        return found, _widened(slopes, asked, self.along)
+        *given, columns = here.task_about(about)
+        found, slopes = in_parts(functools.partial(program, tuple(given)), whole[:, columns], near)
+        return found, _widened(slopes, [here.names[i] for i in columns], self.along)
 
     def moments(
         self, values: np.ndarray, points: np.ndarray | None
@@ -525,21 +504,9 @@ class _Many(NamedTuple):
         different, back = np.unique(frequency, return_inverse=True)
         segments = _arrays_of(settings, self.sampled.window)[1]
         segments = as_arrays(segments) if isinstance(segments, Segments) else segments
-        tables = [
-            jax.tree.map(
-                lambda x, n=count: np.asarray(x)[:n],
-                _line_tables(
-                    _cut(different, i, count),
-                    np.asarray(count),
-                    segments,
-                    settings.sampling,
-                    self.sampled.samples,
-                ),
-            )
-            for i in range(0, len(different), ROWS)
-            for count in [min(ROWS, len(different) - i)]
-        ]
-        table, slope = jax.tree.map(lambda *x: np.concatenate(x)[back], *tables)
+        sampling = settings.sampling, self.sampled.samples
+        tables = _in_calls(lambda f, n: _line_tables(f, n, segments, *sampling), different)
+        table, slope = jax.tree.map(lambda x: x[back], tables)
         by_table = jax.tree.map(
             lambda x: x[..., None] * by.frequency.reshape(len(x), *[1] * (x.ndim - 1), -1), slope
         )
@@ -552,13 +519,9 @@ class _Many(NamedTuple):
 
     def _enveloped(self, seen: "_Seen") -> tuple[np.ndarray, ...]:
         sampled = self.sampled.settings, self.sampled.window
-
-        def program(task: Any, names: Any, place: Any, values: Any, near: Near) -> Any:
-            return _enveloped(task, names, place, sampled, values, near)
-
-        found = self._run(program, seen.here, ("harmonic",), seen.whole, seen.near)
-        (line, swing), (by_line, by_swing) = found
-        return line, swing, by_line, by_swing
+        program = functools.partial(_enveloped, sampled)
+        found, slopes = self._run(program, seen.here, ("harmonic",), seen.whole, seen.near)
+        return *found, *slopes
 
 
 class _Group(NamedTuple):
@@ -593,13 +556,12 @@ class _Group(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """What is known of some rows: values of all names, operating points, where the asked columns
-    are; the parts of the noise, and the line with its slopes."""
+    """What is known of some rows: values of all names, operating points, the parts of the noise,
+    and the line with its slopes."""
 
     here: Mechanics
     whole: np.ndarray
     near: Near
-    columns: np.ndarray
     groups: list[_Group]
     line: _Line | None
     by_line: _Line | None
@@ -615,12 +577,12 @@ class _Seen(NamedTuple):
 
 def noise_parts(task: AbstractTask) -> tuple[Chain, Int[np.ndarray, " parts"]]:
     """The parts of a task's noise along a leading axis, and which component each belongs to."""
-    many = _Many(task, (), (), Sampled(task.settings, WINDOW, 0, 0.0))
+    many = _Many(task, (), (), Sampling(task.settings, WINDOW, 0, 0.0))
     seen = many.seen(np.zeros((1, 0)))
     return seen.alone(), np.concatenate([group.component for group in seen.groups])
 
 
-def variation_sd_of_numbers(task: AbstractTask, sampled: Sampled, lags: int) -> Array:
+def variation_sd_of_numbers(task: AbstractTask, sampled: Sampling, lags: int) -> Array:
     """`log_variation_sd` of a task's output, good for that many lags."""
     sampled = sampled._replace(samples=as_arrays(sampled.samples, int))
     many, settings = _Many(task, (), (), sampled), sampled.settings
@@ -634,16 +596,16 @@ def variation_sd_of_numbers(task: AbstractTask, sampled: Sampled, lags: int) -> 
     line = swing, task.harmonic.frequency / settings.rate
     sampling = settings.sampling, lags
     given, line = as_arrays((given, line))
-    return _variation_sd(rows, given, line, sampled.samples, sampling)
+    return _variation_of_parts(rows, given, line, sampled.samples, sampling)
 
 
 @kept
-def _variation_sd(
+def _variation_of_parts(
     parts: Chain, given: Any, line: Any, samples: Any, sampling: tuple[str, int]
 ) -> Array:
     """`log_variation_sd` of those parts that count, 1 or 0 for each."""
     (counts, spread, interval), (swing, turns), (kind, lags) = given, line, sampling
-    each = autocovariance(parts, interval, lags, kind, 0.0)
+    each = sampled_autocovariance(parts, interval, lags, kind, 0.0)
     r, slow = counts @ each.lagged(lags), counts @ each.mean_variance(samples)
     return log_variation_sd(r, spread, slow, swing, turns, samples)
 
