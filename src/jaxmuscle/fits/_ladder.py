@@ -17,7 +17,12 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, Plan
 from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import log_marginal, measured_bins
-from jaxmuscle.objective._starts import continued, kinds_of_starts, starting_points
+from jaxmuscle.objective._starts import (
+    continued,
+    kinds_of_starts,
+    muscle_of_response,
+    starting_points,
+)
 
 from ._adequacy import ADEQUATE, Endpoint, rows_of
 from ._checks import Stage
@@ -93,7 +98,12 @@ def first_rung(targets: list[Target], lowest: int, top: int) -> int:
     return min(asked, top)
 
 
-def climb(models: Models, descend: Descend, keep: Callable[[Climbed], None]) -> tuple[Rung, ...]:
+def climb(
+    models: Models,
+    descend: Descend,
+    keep: Callable[[Climbed], None],
+    before: Climbed | None = None,
+) -> tuple[Rung, ...]:
     """Fit one model after the other until one describes the data; `keep` gets each that is the best
     so far.
 
@@ -101,15 +111,20 @@ def climb(models: Models, descend: Descend, keep: Callable[[Climbed], None]) -> 
     An adequate model is no end in two cases, and a further one is then taken if its AIC is lower by
     more than 2. A resonance for the tremor that came out narrower than a bin may be a line, for
     which the models with a harmonic are tried. And so is the first of these beside noise alone, if
-    the spectrum shows a significant line.
+    the spectrum shows a significant line. `before`: the best for nearly the same data, where the
+    first model then begins.
     """
     tried: list[Climbed] = []
     best: Climbed | None = None
+    muscle: dict[str, float] | None = None
     waiting = list(range(models.first, models.top + 1))
     while waiting:
         number = waiting.pop(0)
         plan = models.plan_at(number)
-        points, plan = _begin(plan, best)
+        if muscle is None:
+            moved = any(part.points is not None for part in plan.problem.parts)
+            muscle = muscle_of_response(plan.problem) if moved else {}
+        points, plan = _begin(plan, best or before, muscle)
         stages: list[Stage] = []
         share = DESCENDED / (models.top - models.lowest + 1)
         begin = len(tried) * share
@@ -160,18 +175,20 @@ def _telling(plan: Plan, which: str, begin: float, end: float) -> Plan:
     return plan._replace(problem=dataclasses.replace(plan.problem, tell=own))
 
 
-def _begin(plan: Plan, best: Climbed | None) -> tuple[Float[np.ndarray, "starts free"], Plan]:
+def _begin(
+    plan: Plan, best: Climbed | None, muscle: dict[str, float]
+) -> tuple[Float[np.ndarray, "starts free"], Plan]:
     """Starts of a model, and its plan with these; of a richer one for the most part where what it
-    shares with the best one ended."""
+    shares with the best one ended. `muscle`: that of `muscle_of_response`."""
     problem, count = plan.problem, plan.starts if best is None else _fewer(plan.starts)
     if best is None:
-        points = starting_points(problem, count)
+        points = starting_points(problem, count, muscle)
     else:
         before, known = best.plan.problem, dict[str, float]()
         for part, task in zip(before.parts, before.tasks_at(best.ended.seen.theta), strict=True):
             for column, name in zip(part.columns, part.coordinates.names, strict=True):
                 known.setdefault(before.coordinates.names[column], float(task[name]))
-        points = continued(problem, count, known)
+        points = continued(problem, count, known, muscle)
     kinds = kinds_of_starts(problem, count, continued=best is not None)
     return points, plan._replace(settings=plan.settings | {"starts": count}, kinds=kinds)
 

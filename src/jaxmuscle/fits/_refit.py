@@ -3,19 +3,17 @@ anew."""
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._consequences import Consequences, Expansion
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.objective._residuals import Residuals
-from jaxmuscle.response._harmonic_line import line_levels
+from jaxmuscle.response._rows import line_levels
 
 LINES = 128
 # residuals whose costs are found at a time: what lies in the directions of all lines is large
@@ -189,8 +187,7 @@ def lines_of(
 ) -> Lines:
     """Lines over the band beside noise of these powers, and one more frequency."""
     frequency = over_band(part.target, LINES)
-    levels = line_levels(as_arrays(task), part.target.settings, np.append(frequency, last))
-    each, gain = jax.tree.map(np.asarray, levels)
+    each, gain = line_levels(task, part.target.settings, np.append(frequency, last))
     each = each[:, part.chosen]
     square = STRENGTHS[:, None] / np.max(each[:-1] / noise, axis=1)
     often = len(STRENGTHS)

@@ -72,9 +72,11 @@ class _Search:
     stages: list[Stage] = dataclasses.field(default_factory=list)
     known: "Known | None" = None
     ladder: tuple[Rung, ...] = ()
+    best: Climbed | None = None
 
     def keep(self, found: Climbed) -> None:
         """Go on from this model."""
+        self.best = found
         self.plan, self.known = found.plan, found.known
         self.stages[:] = found.stages
 
@@ -103,7 +105,7 @@ class _Search:
             anew = models.renewed(_reached(self.plan, self.stages))
             # until they have been tried, what was found before stays
             better: list[Climbed] = []
-            tried = () if anew is None else climb(anew, _descended, better.append)
+            tried = () if anew is None else climb(anew, _descended, better.append, self.best)
             if anew is None or not better:
                 return
             self.ladder, models = tried, anew
@@ -195,7 +197,8 @@ def search_together(
     """
     problems = [plan.problem for plan in plans]
     plans = [p._replace(kinds=kinds_of_starts(p.problem, p.starts)) for p in plans]
-    points = [starting_points(plan.problem, plan.starts, alone=not replicates) for plan in plans]
+    muscle: dict[str, float] | None = {} if replicates else None
+    points = [starting_points(plan.problem, plan.starts, muscle) for plan in plans]
     objectives = [problem.linear() for problem in problems]
     first = _together(objectives, points, plans[0].max_steps, "trying starts", tell, (0.0, 0.7))
     best = [

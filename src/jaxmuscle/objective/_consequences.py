@@ -1,13 +1,14 @@
 """What follows from a point θ: moments and derived quantities with their slopes, residuals."""
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
@@ -263,10 +264,11 @@ def _moments_and_slopes(
 def expand(
     objective: Any, theta: Float[np.ndarray, "points free"], *, slopes: bool = True
 ) -> Expansion:
-    """The moments of every part and their slopes at every θ, as numbers; without `slopes` these are
-    not computed, and zero."""
+    """The moments of every part and their slopes at every θ, as numbers; without `slopes`, and
+    along what is not moving, these are not computed, and zero."""
+    moving = np.asarray(objective.moving) > 0
     each = [
-        _expanded(part, np.asarray(objective.own(theta, i)), slopes)
+        _expanded(part, np.asarray(objective.own(theta, i)), slopes & objective.own(moving, i))
         for i, part in enumerate(objective.parts)
     ]
     spread = objective.spread  # asked for once: every time it makes an object
@@ -276,16 +278,21 @@ def expand(
     return Expansion(theta, tuple(moments for moments, _ in each), along)
 
 
-def _expanded(part: Any, theta: Float[np.ndarray, "points own"], slopes: bool) -> tuple[Any, Any]:
-    """Moments of one part and their slopes: a linear response by the programs that all share, a
-    Monte Carlo simulation for all points together."""
+def _expanded(
+    part: Any, theta: Float[np.ndarray, "points own"], moving: Bool[np.ndarray, " own"]
+) -> tuple[Any, Any]:
+    """Moments of one part and their slopes along what is moving: a linear response by the programs
+    that all share, a Monte Carlo simulation for all points together."""
     if not isinstance(part.model, Linear):
         return jax.tree.map(np.asarray, _moments_and_slopes(part, theta))
     names, values = part.coordinates.names, part.coordinates.values_of(theta)
-    moments, along = part.model.of_rows(part.task, names, values, names if slopes else ())
-    if not slopes:
-        return moments, jax.tree.map(lambda x: np.zeros((*np.shape(x), len(names))), moments)
-    stretch = part.coordinates.slope(values)
-    return moments, jax.tree.map(
-        lambda x: x * stretch.reshape(len(values), *[1] * (x.ndim - 2), -1), along
-    )
+    along = tuple(itertools.compress(names, moving))
+    moments, slopes = part.model.of_rows(part.task, names, values, along)
+    stretch = part.coordinates.slope(values)[:, moving]
+
+    def spread(x: np.ndarray) -> np.ndarray:
+        whole = np.zeros((*np.shape(x)[:-1], len(names)))
+        whole[..., moving] = x * stretch.reshape(len(values), *[1] * (np.ndim(x) - 2), -1)
+        return whole
+
+    return moments, jax.tree.map(spread, slopes)

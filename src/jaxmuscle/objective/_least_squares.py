@@ -1,6 +1,7 @@
 """Levenberg-Marquardt from many starts at once, one optimistix step at a time, so that it can be
 watched and stopped."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmuscle._common.programs import kept
+from jaxmuscle.response._linearised import in_parts
 
 from ._consequences import Expansion, expand
 from ._residuals import free_size
@@ -20,7 +22,6 @@ REFUSALS = 10
 # of the way to where it would count, gained by a step: a start that needs two hundred more such
 # steps
 HOPELESS = 0.005
-ROWS = 128
 
 
 class Minima(NamedTuple):
@@ -115,8 +116,7 @@ def _is_shape(leaf):
 
 
 class _Standing(NamedTuple):
-    """Every start (and filled-up) row: where it is and looks next, its cost, accepted steps,
-    successive small gains."""
+    """Every start: where it is and looks next, its cost, accepted steps, successive small gains."""
 
     s: np.ndarray
     ahead: np.ndarray
@@ -137,7 +137,7 @@ class _Standing(NamedTuple):
         accepted: np.ndarray,
         margin: float,
     ) -> "_Standing":
-        """After a step of the active rows; the others stay as they are."""
+        """After a step of the active starts; the others are given as they were."""
         moved = self.active & (accepted > self.accepted)
         with np.errstate(invalid="ignore"):
             gain = np.where(np.isfinite(self.cost), (self.cost - cost) / self.cost, np.inf)
@@ -148,12 +148,11 @@ class _Standing(NamedTuple):
             slow = (away > 0) & (self.cost - cost < HOPELESS * away)
         behind = np.where(moved, np.where(slow, self.behind + 1, 0), self.behind)
         refused = np.where(moved, 0, self.refused + self.active)
-        keep = self.active[:, None]
         return _Standing(
-            np.where(keep, s, self.s),
-            np.where(keep, ahead, self.ahead),
-            np.where(self.active, cost, self.cost),
-            np.where(self.active, accepted, self.accepted),
+            s,
+            ahead,
+            cost,
+            accepted,
             small,
             still,
             behind,
@@ -162,9 +161,9 @@ class _Standing(NamedTuple):
             self.active & (still < 2) & (behind < 2) & (refused < REFUSALS) & np.isfinite(cost),
         )
 
-    def minima(self, count: int) -> Minima:
+    def minima(self) -> Minima:
         settled = (self.small >= 1) & np.isfinite(self.cost)
-        return Minima(self.s[:count], self.cost[:count], self.steps[:count], settled[:count])
+        return Minima(self.s, self.cost, self.steps, settled)
 
 
 def least_squares(
@@ -188,39 +187,41 @@ def least_squares(
     sees every step's outcome.
     """
     count, free = starts.shape
-    batched = objective.linear
-    fill = -count % ROWS if batched else 0
-    s = np.concatenate([starts, np.broadcast_to(starts[-1], (fill, free))])
-    none, nothing = np.zeros(len(s), dtype=int), np.full(len(s), np.inf)
-    now = _Standing(s, s, nothing, none, none, none, none, none, none, np.arange(len(s)) < count)
-    last = np.minimum(np.arange(count + fill), count - 1)
-    data = jax.tree.map(
-        lambda x: np.asarray(x)[last], for_all(objective.data, count) if data is None else data
-    )
+    none, all = np.zeros(count, dtype=int), np.ones(count, dtype=bool)
+    nothing = np.full(count, np.inf)
+    now = _Standing(starts, starts, nothing, none, none, none, none, none, none, all)
+    data = jax.tree.map(np.asarray, for_all(objective.data, count) if data is None else data)
     # What the steps take: one program for fits of any task and any free parameters.
     filled, more = objective.filled(), free_size(free) - free
 
     def wide(x: np.ndarray) -> np.ndarray:
         return np.pad(x, [*[(0, 0)] * (x.ndim - 1), (0, more)])
 
-    seen = state = None
+    state: Any = None
     for _ in range(max_steps):
-        rows = np.flatnonzero(now.active) if batched else np.arange(count)
+        # simulations are compiled for one number of points
+        rows = np.flatnonzero(now.active) if objective.linear else np.arange(count)
         objective = prepare(objective, now.ahead[rows])
-        new = expand(objective, np.asarray(objective.theta(now.ahead[rows]))).compared(wide)
-        if seen is None:
-            seen = jax.tree.map(lambda x: x[last], new)
-            state = _start(filled, data, wide(now.s), seen)
+        seen = expand(objective, np.asarray(objective.theta(now.ahead[rows]))).compared(wide)
+        own, s = jax.tree.map(lambda x, rows=rows: x[rows], data), wide(now.s[rows])
+        if state is None:
+            state = before = in_parts(functools.partial(_start, filled), own, s, seen)
         else:
-            seen = jax.tree.map(lambda old, x, rows=rows: _put(old, rows, x), seen, new)
-        s, state, ahead, cost, accepted = _step(filled, data, wide(now.s), state, seen)
-        s, ahead, cost, accepted = map(np.asarray, (s, ahead, cost, accepted))
-        s, ahead = s[:, :free], ahead[:, :free]
+            before = [x[rows] for x in state]
+        s, after, ahead, cost, accepted = in_parts(
+            functools.partial(_step, filled), own, s, before, seen
+        )
+        state = [_put(old, rows, x) for old, x in zip(state, after, strict=True)]
+        live, known = now.active[rows], (now.s, now.ahead, now.cost, now.accepted)
+        reached = s[:, :free], ahead[:, :free], cost, accepted
+        s, ahead, cost, accepted = (
+            _put(old, rows[live], x[live]) for old, x in zip(known, reached, strict=True)
+        )
         now = now.advanced(s, ahead, cost, accepted, margin)
-        report(now.minima(count))
+        report(now.minima())
         if not np.any(now.active):
             break
-    return now.minima(count)
+    return now.minima()
 
 
 def for_all(data: Any, count: int) -> Any:

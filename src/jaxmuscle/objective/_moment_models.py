@@ -55,7 +55,8 @@ class Linear(eqx.Module):
     simulation, say).
 
     Its variance is that of a recording of so many `samples`, `recorded` at an interval [s].
-    `points`: frequencies of a measured dynamic stiffness [Hz].
+    `points`: frequencies of a measured dynamic stiffness [Hz]. Unless `spectral`, rows have ones in
+    place of power and variance: of a search that compares neither.
     """
 
     chosen: np.ndarray
@@ -64,6 +65,7 @@ class Linear(eqx.Module):
     window: tuple[float, float] = eqx.field(static=True)
     points: Float[Array | np.ndarray, " points"] | None = None
     recorded: Float[Array | np.ndarray, ""] | float = 0.0
+    spectral: bool = eqx.field(static=True, default=True)
 
     def moments(self, task: AbstractTask) -> Moments:
         """Expected moments of the task's output that are compared with data."""
@@ -84,7 +86,9 @@ class Linear(eqx.Module):
         """The same with each row of values, and their slopes along a last axis."""
         sampled = Sampling(task.settings, self.window, self.samples, self.recorded)
         points = None if self.points is None else np.asarray(self.points)
-        moments, slopes, _ = moments_of_rows(task, own, values, sampled, points, along)
+        moments, slopes, _ = moments_of_rows(
+            task, own, values, sampled, points, along, spectral=self.spectral
+        )
         slopes = self._chosen(
             slopes, lambda x, c: x * np.asarray(c)[..., None], lambda x: x[:, self.chosen]
         )

@@ -35,7 +35,7 @@ UNKNOWN = 1e6  # standard deviation of a log power that is not to count
 
 
 def starting_points(
-    problem: FitProblem, count: int, *, alone: bool = True
+    problem: FitProblem, count: int, muscle: Mapping[str, float] | None = None
 ) -> Float[np.ndarray, "starts free"]:
     """Starts: harmonic frequencies at the targets' local maxima and spread over their band, the
     rest space-filling.
@@ -43,7 +43,7 @@ def starting_points(
     The first start has all other parameters at their default, the others at half a prior standard
     deviation about it. With several frequencies which of their candidates meet is left to chance;
     `recombined` tries the rest. Of a moved record some begin at the muscle that its response alone
-    asks for, unless `alone` is False, which saves the time of that search.
+    asks for, `muscle_of_response` unless given.
     """
     coordinates = problem.coordinates
     theta = space_filling(len(coordinates.names), count)
@@ -55,21 +55,24 @@ def starting_points(
     _spread_resonances(problem, theta)
     if any(part.points is not None for part in problem.parts):
         _spread_coefficients(problem, theta)
-        points = coordinates.from_theta(theta)
-        return _on_response(problem, points) if alone else points
+        muscle = muscle_of_response(problem) if muscle is None else muscle
+        return _on_response(problem, coordinates.from_theta(theta), muscle)
     return coordinates.from_theta(theta)
 
 
 def continued(
-    problem: FitProblem, count: int, known: Mapping[str, float]
+    problem: FitProblem,
+    count: int,
+    known: Mapping[str, float],
+    muscle: Mapping[str, float] | None = None,
 ) -> Float[np.ndarray, "starts free"]:
     """Starts of a further model: in two thirds of them what it shares with another one begins where
-    that ended (`known`), but for those at peaks.
+    that ended (`known`), but for those at peaks. `muscle` as in `starting_points`.
 
     In the third of them a narrow resonance stands for its harmonic.
     """
     c = problem.coordinates
-    points = np.array(c.theta(starting_points(problem, count)))
+    points = np.array(c.theta(starting_points(problem, count, muscle)))
     rows = np.flatnonzero(np.array(kinds_of_starts(problem, count, continued=True)) == OTHER_MODEL)
     for column, name in enumerate(c.names):
         if name in known and c.positive[column]:
@@ -192,7 +195,7 @@ def _spread_coefficients(problem: FitProblem, theta: Float[np.ndarray, "starts f
 
 
 def _on_response(
-    problem: FitProblem, points: Float[np.ndarray, "starts free"]
+    problem: FitProblem, points: Float[np.ndarray, "starts free"], muscle: Mapping[str, float]
 ) -> Float[np.ndarray, "starts free"]:
     """Some of the starts are found in two steps: the muscle by its response alone, then what makes
     it fluctuate.
@@ -202,17 +205,14 @@ def _on_response(
     where the dynamic stiffness alone is fitted best, and where beside this muscle the fluctuations
     are.
     """
-    rows = _answering_rows(len(points))
-    answers = np.isin([name.partition("@")[0] for name in problem.coordinates.names], RESPONSE)
-    # of an own muscle nobody knows which parameters answer
-    if not problem.control or not len(rows) or not np.any(answers):
+    rows, c = _answering_rows(len(points)), problem.coordinates
+    if not len(rows) or not muscle:
         return points
-    objective = problem.linear()
-    answer = _answering(problem, objective)
-    if answer is None:
-        return points
-    points = points.copy()
-    points[np.ix_(rows, answers)] = answer[answers]
+    answers, theta = np.isin(c.names, list(muscle)), np.zeros((1, len(c.names)))
+    for name in itertools.compress(c.names, answers):
+        theta[:, c.names.index(name)] = c.theta_of(name, muscle[name])
+    points, objective = points.copy(), problem.linear()
+    points[np.ix_(rows, answers)] = c.from_theta(theta)[0, answers]
     held = dataclasses.replace(objective, moving=np.where(answers, 0.0, objective.moving))
     beside = least_squares(held, points[rows], STEPS)
     points[rows] = np.where(np.isfinite(beside.cost)[:, None], beside.s, points[rows])
@@ -223,12 +223,20 @@ def _answering_rows(count: int) -> Int[np.ndarray, " rows"]:
     return np.arange(2 * count // 3, count)[::2][:MOST]
 
 
-def _answering(problem: FitProblem, objective: Residuals) -> Float[np.ndarray, " free"] | None:
-    """Where the dynamic stiffness alone is fitted best, of some searches and, unless these agree,
-    of more."""
-    spread = np.zeros((2 * sum(SEARCHES), len(problem.coordinates.names)))
+def muscle_of_response(problem: FitProblem) -> dict[str, float]:
+    """Values of the muscle with which the dynamic stiffness alone is fitted best, of some searches
+    and, unless these agree, of more. Nothing where that is not known: of an own muscle nobody
+    knows which parameters answer.
+
+    It does not depend on what makes the muscle fluctuate: models that differ in that share it.
+    """
+    c = problem.coordinates
+    answers = np.isin([name.partition("@")[0] for name in c.names], RESPONSE)
+    if not problem.control or not np.any(answers):
+        return {}
+    spread = np.zeros((2 * sum(SEARCHES), len(c.names)))
     _spread_coefficients(problem, spread)
-    starts = problem.coordinates.from_theta(spread[1::2])
+    starts, objective = c.from_theta(spread[1::2]), _without_spectra(problem.linear(), answers)
     blind = tuple(map(_blind, objective.data))
     ends, cost = np.zeros((0, starts.shape[1])), np.zeros(0)
     for some in np.split(starts, np.cumsum(SEARCHES)[:-1]):
@@ -239,7 +247,20 @@ def _answering(problem: FitProblem, objective: Residuals) -> Float[np.ndarray, "
         )
         if np.sum(cost < np.min(cost) + SAME) >= AGREEING:
             break
-    return ends[np.argmin(cost)] if np.isfinite(np.min(cost)) else None
+    if not np.isfinite(np.min(cost)):
+        return {}
+    values = c.values_of(np.asarray(c.theta(ends[[np.argmin(cost)]])))[0]
+    return {name: float(values[i]) for i, name in enumerate(c.names) if answers[i]}
+
+
+def _without_spectra(objective: Residuals, answers: Bool[np.ndarray, " free"]) -> Residuals:
+    """The same for data that are `_blind`, with nothing moving but what answers."""
+    parts = (
+        dataclasses.replace(part, model=dataclasses.replace(part.model, spectral=False))
+        for part in objective.parts
+    )
+    moving = np.where(answers, objective.moving, 0.0)
+    return dataclasses.replace(objective, parts=tuple(parts), moving=moving)
 
 
 def _blind(data: Data) -> Data:

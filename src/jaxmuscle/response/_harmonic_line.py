@@ -9,15 +9,14 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from jaxmuscle._common.matrices import exponential
-from jaxmuscle._common.programs import kept
 from jaxmuscle.model._signals import Constant
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._bin_law import bin_rows, sides_of
 from jaxmuscle.spectra._decimation import FINER, anti_alias
-from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings, tapers_of
+from jaxmuscle.spectra._settings import SpectrumSettings, tapers_of
 from jaxmuscle.spectra._welch import lowpass, spectrum_of
 
-from ._linearised import Linearisation, linearise
+from ._linearised import Linearisation
 from ._transfer import harmonic_system, times_i, transfer, turn_of
 
 # samples of a segment: beyond, a fast Fourier transform takes the place of matrices, whose size is
@@ -142,23 +141,6 @@ class LineTable(NamedTuple):
             0.5 * (jnp.abs(reply) ** 2 * self.passed - jnp.real(reply**2 * self.twice))
             - jnp.imag(reply * self.once) ** 2
         )
-
-
-@kept
-def line_levels(
-    task: AbstractTask, settings: SpectrumSettings, frequency: Float[Array | np.ndarray, " lines"]
-) -> tuple[Float[Array, "lines bins"], Float[Array, " lines"]]:
-    """Of lines of these frequencies [Hz] in the output: Welch power of a mean square of 1 behind
-    the low-pass, the phase averaged; and the mean square behind the low-pass that a harmonic of
-    amplitude √2 has."""
-    system = harmonic_system(task, linearise(task))
-
-    def one(f):
-        table = line_table(settings, WINDOW, f, 1)
-        reply = transfer(system, 2 * jnp.pi * f)
-        return 2 * table.level[0] / table.passed, jnp.abs(reply) ** 2 * table.passed
-
-    return jax.lax.map(one, jnp.asarray(frequency))
 
 
 def _turns(

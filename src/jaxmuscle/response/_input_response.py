@@ -10,13 +10,24 @@ from jaxtyping import Array, Complex, Float
 
 from jaxmuscle._common.arrays import all_concrete, as_arrays
 from jaxmuscle._common.programs import kept
-from jaxmuscle.model._parameters import INPUTS
+from jaxmuscle.model._parameters import INPUTS, set_parameters
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
 
 from ._equilibrium import HOLD
-from ._linearised import Linearisation, check_equilibrium, check_inputs, linearisation, linearise
+from ._linearised import (
+    Linearisation,
+    Mechanics,
+    Near,
+    check_equilibrium,
+    check_inputs,
+    in_parts,
+    linearisation,
+    linearise,
+    value_and_slopes,
+)
 from ._transfer import SignalSystem, polynomial, polynomials, system_of, times_i
 
+AT_ONCE = 64  # frequencies of the program of `stiffness_rows`
 Frequencies = Float[Array | np.ndarray, " frequencies"]
 
 
@@ -89,8 +100,31 @@ def density_at(
 
 
 @kept
-def _stiffness(task: Any, f: Any) -> Complex[Array, " frequencies"]:
-    return stiffness_at(task, linearise(task), f)
+def _stiffness(
+    task: AbstractTask, names: tuple[str, ...], near: Near, f: Float[Array | np.ndarray, " points"]
+) -> tuple[Array, Array]:
+    def one(near):
+        def parts(values):
+            there = set_parameters(task, dict(zip(names, values, strict=True)))
+            return parts_of_stiffness(there, near.at(values).system, f)
+
+        return value_and_slopes(parts, near.values)
+
+    return jax.vmap(one)(near)
+
+
+def stiffness_rows(
+    here: Mechanics, near: Near, f: Float[np.ndarray, " frequencies"]
+) -> tuple[Float[np.ndarray, "rows 2 frequencies"], Float[np.ndarray, "rows 2 frequencies moving"]]:
+    """`parts_of_stiffness` at each row of operating points, and its slopes with respect to the
+    mechanical values."""
+    blocks = max(-(-len(f) // AT_ONCE), 1)
+    found = [
+        in_parts(lambda near, own=own: _stiffness(here.bare, here.moving, near, own), near)
+        for own in as_arrays(np.resize(f, (blocks, AT_ONCE)))
+    ]
+    value, slopes = jax.tree.map(lambda *x: np.concatenate(x, axis=2), *found)
+    return value[:, :, : len(f)], slopes[:, :, : len(f)]
 
 
 @kept
@@ -128,7 +162,12 @@ def dynamic_stiffness(task: AbstractTask, frequency: Frequencies) -> Complex[Arr
     moves or there is no stable equilibrium.
     """
     _checked(_perturbed(task))
-    return _stiffness(as_arrays(task), jnp.asarray(frequency, jnp.result_type(float)))
+    if not all_concrete((task, frequency)):
+        return stiffness_at(_perturbed(task), linearise(task), frequency)
+    here = Mechanics.of(task)
+    _, near = here.at(np.zeros((1, 0)))
+    (value,), _ = stiffness_rows(here, near, np.ravel(frequency))
+    return jnp.asarray((value[0] + 1j * value[1]).reshape(np.shape(frequency)))
 
 
 def noise_density(task: AbstractTask, frequency: Frequencies) -> Float[Array, " frequencies"]:

@@ -42,7 +42,7 @@ from ._harmonic_line import (
     segments_of,
     table_of,
 )
-from ._input_response import parts_of_stiffness
+from ._input_response import stiffness_rows
 from ._linearised import (
     Linearisation,
     LinearTask,
@@ -82,10 +82,12 @@ def moments_of_rows(
     sampled: Sampling,
     points: Float[np.ndarray, " points"] | None = None,
     along: Sequence[str] | None = None,
+    *,
+    spectral: bool = True,
 ) -> tuple[Moments, Moments, Linearisation]:
     """Moments of the task with each row of natural values for its `own` names, their slopes `along`
     these (or some of them) in a last axis, and the linearisations. As `response`, whose numbers
-    these are.
+    these are. Unless `spectral`, power and variance are not computed, and one.
 
     A moment is a sum over the parts p of the noise, M = Σ_p m(x_p), and its slope with respect to a
     value v is `Σ_p m'(x_p) dx_p/dv`: a row of the large program is a part and one direction. So it
@@ -94,7 +96,7 @@ def moments_of_rows(
     sampled = sampled._replace(
         samples=as_arrays(sampled.samples, int), recorded=as_arrays(sampled.recorded)
     )
-    many = _Many(task, tuple(own), tuple(own if along is None else along), sampled)
+    many = _Many(task, tuple(own), tuple(own if along is None else along), sampled, spectral)
     found = [many.moments(values[i : i + MANY], points) for i in range(0, len(values), MANY)]
     return jax.tree.map(lambda *x: np.concatenate(x), *found)
 
@@ -189,22 +191,6 @@ def _filled(system: SignalSystem, size: int) -> SignalSystem:
     return SignalSystem(A, jnp.pad(system.b, (0, more)), jnp.pad(system.c, (0, more)), *system[3:])
 
 
-@kept
-def _stiffness(
-    task: AbstractTask, names: tuple[str, ...], near: Near, f: Float[Array | np.ndarray, " points"]
-) -> tuple[Array, Array]:
-    """Dynamic stiffness of a bare task with each row of its mechanical values, and its slopes."""
-
-    def one(near):
-        def parts(values):
-            there = set_parameters(task, dict(zip(names, values, strict=True)))
-            return parts_of_stiffness(there, near.at(values).system, f)
-
-        return value_and_slopes(parts, near.values)
-
-    return jax.vmap(one)(near)
-
-
 def _in_blocks(
     function: Callable[[Any], Any], rows: Any, towards: Any, count: Array, block: int = BLOCK
 ) -> Any:
@@ -275,6 +261,30 @@ def _line_tables(
         return jax.vmap(lambda f: table_of(made, f, samples, sampling, settings))(frequency)
 
     return _in_blocks(tables, frequency, jnp.ones_like(frequency), count, FEW)
+
+
+@kept
+def _replies(
+    system: SignalSystem, frequency: Float[Array | np.ndarray, " lines"]
+) -> Float[Array, " lines"]:
+    """Mean square of the response to an input of amplitude √2 of each frequency [Hz]."""
+    return jnp.abs(jax.vmap(lambda f: transfer(system, 2 * jnp.pi * f))(frequency)) ** 2
+
+
+def line_levels(
+    task: AbstractTask, settings: SpectrumSettings, frequency: Float[np.ndarray, " lines"]
+) -> tuple[Float[np.ndarray, "lines bins"], Float[np.ndarray, " lines"]]:
+    """Of lines of these frequencies [Hz] in the output: Welch power of a mean square of 1 behind
+    the low-pass, the phase averaged; and the mean square behind the low-pass that a harmonic of
+    amplitude √2 has."""
+    many = _Many(task, (), (), Sampling(settings, WINDOW, as_arrays(1, int), 0.0))
+    here = Mechanics.of(task)
+    line, _ = many.about(_line_of, here, ("harmonic",), *here.at(np.zeros((1, 0))))
+    system = jax.tree.map(lambda x: x[0], line.system)
+    table, _ = many.tables(as_arrays(frequency))
+    passed = np.asarray(table.passed)
+    levels = np.asarray(table.level)[:, 0, : len(settings.frequency)] / passed[:, None]
+    return 2 * levels, np.asarray(_replies(system, as_arrays(frequency))) * passed
 
 
 @kept
@@ -400,13 +410,14 @@ class _Many(NamedTuple):
     own: tuple[str, ...]
     along: tuple[str, ...]
     sampled: Sampling
+    spectral: bool = True
 
     def seen(self, values: np.ndarray) -> "_Seen":
         """At some rows."""
         here = Mechanics.of(self.task, self.own)
         whole, near = here.at(values)
         each = [
-            self._run(_parts_of, here, ("noise", *place), whole, near) for place in here.components
+            self.about(_parts_of, here, ("noise", *place), whole, near) for place in here.components
         ]
         groups = []
         for size in range(len(SIZES)):
@@ -422,10 +433,10 @@ class _Many(NamedTuple):
                 )
         line = by_line = None
         if isinstance(self.task.harmonic.envelope, Constant):
-            line, by_line = self._run(_line_of, here, ("harmonic",), whole, near)
+            line, by_line = self.about(_line_of, here, ("harmonic",), whole, near)
         return _Seen(here, whole, near, groups, line, by_line)
 
-    def _run(
+    def about(
         self, program: Any, here: Mechanics, about: tuple, whole: np.ndarray, near: Near
     ) -> tuple[Any, Any]:
         """A program about one component, and its slopes along one's own."""
@@ -437,39 +448,50 @@ class _Many(NamedTuple):
         self, values: np.ndarray, points: np.ndarray | None
     ) -> tuple[Moments, Moments, Linearisation]:
         """Of some rows."""
-        seen = self.seen(values)
-        here, near = seen.here, seen.near
+        here = Mechanics.of(self.task, self.own)
+        near = here.at(values)[1]
 
         def widened(slope: Any) -> np.ndarray:
             return _widened(slope, here.moving, self.along)
 
-        power, variance, by_power, by_variance, resonant, by_resonant = self.noise(seen)
-        line, swing, by_line, by_swing = self.line(seen)
-        stiffness = by_stiffness = ()
+        power, line, variance, resonant = self._spectra(values)
+        stiffness: Any = ((), ())
         if points is not None:
-            f = as_arrays(np.resize(points, -(-len(points) // 64) * 64))
-            stiffness, slope = in_parts(
-                lambda near: _stiffness(here.bare, here.moving, near, f), near
-            )
-            stiffness = stiffness[:, :, : len(points)]
-            by_stiffness = widened(slope)[:, :, : len(points)]
+            value, slope = stiffness_rows(here, near, points)
+            stiffness = value, widened(slope)
         system = near.point.system
-        return (
-            Moments(power + line, line, system.rest, variance + swing, resonant, stiffness),
-            Moments(
-                by_power + by_line,
-                by_line,
-                widened(near.slopes.system.rest),
-                by_variance + by_swing,
-                by_resonant,
-                by_stiffness,
-            ),
-            system,
+        mean = system.rest, widened(near.slopes.system.rest)
+        value, slope = (
+            Moments(*each)
+            for each in zip(power, line, mean, variance, resonant, stiffness, strict=True)
         )
+        return value, slope, system
+
+    def _spectra(self, values: np.ndarray) -> tuple[Any, ...]:
+        """Power of all and of the harmonic, variance, power of the resonances, each with its
+        slopes."""
+        if not self.spectral:
+            return self._ones(len(values))
+        seen = self.seen(values)
+        power, variance, resonant = self.noise(seen)
+        line, swing = self.line(seen)
+        power, variance = (
+            tuple(x + own for x, own in zip(*both, strict=True))
+            for both in ((power, line), (variance, swing))
+        )
+        return power, line, variance, resonant
+
+    def _ones(self, rows: int) -> tuple[Any, ...]:
+        """In place of spectra that nobody asks for."""
+        components, columns = self.task.noise.components, len(self.along)
+        each = np.ones((rows, len(self.sampled.settings.frequency)))
+        count = sum(isinstance(noise, ResonantNoise) for noise in components)
+        resonant = (each,) * count
+        found = each, 0 * each, np.ones(rows), resonant
+        return tuple((x, jax.tree.map(lambda x: np.zeros((*x.shape, columns)), x)) for x in found)
 
     def noise(self, seen: "_Seen") -> tuple[Any, ...]:
-        """Power and variance of all noise, their slopes, and power of every resonance with its
-        slopes."""
+        """Power and variance of all noise, and power of every resonance, each with its slopes."""
         settings = self.sampled.settings
         program = functools.partial(
             _noise_rows,
@@ -484,7 +506,7 @@ class _Many(NamedTuple):
             np.concatenate(x, axis=1) for x in zip(*each, strict=True)
         )
         component = np.concatenate([group.component for group in seen.groups])
-        resonant, by_resonant = (
+        resonant = (
             tuple(
                 np.sum(x[:, component == i], axis=1)
                 for i, noise in enumerate(self.task.noise.components)
@@ -492,21 +514,20 @@ class _Many(NamedTuple):
             )
             for x in (power, by_power)
         )
-        sums = (np.sum(x, axis=1) for x in (power, variance, by_power, by_variance))
-        return (*sums, resonant, by_resonant)
+        power, variance = (
+            tuple(np.sum(x, axis=1) for x in both)
+            for both in ((power, by_power), (variance, by_variance))
+        )
+        return power, variance, tuple(resonant)
 
-    def line(self, seen: "_Seen") -> tuple[np.ndarray, ...]:
-        """Power and variance of the harmonic, and their slopes."""
+    def line(self, seen: "_Seen") -> tuple[Any, Any]:
+        """Power and variance of the harmonic, each with its slopes."""
         line, by = seen.line, seen.by_line
         if line is None or by is None:
             return self._enveloped(seen)
         settings, frequency = self.sampled.settings, np.asarray(line.frequency)
         different, back = np.unique(frequency, return_inverse=True)
-        segments = _arrays_of(settings, self.sampled.window)[1]
-        segments = as_arrays(segments) if isinstance(segments, Segments) else segments
-        sampling = settings.sampling, self.sampled.samples
-        tables = _in_calls(lambda f, n: _line_tables(f, n, segments, *sampling), different)
-        table, slope = jax.tree.map(lambda x: x[back], tables)
+        table, slope = jax.tree.map(lambda x: x[back], self.tables(different))
         by_table = jax.tree.map(
             lambda x: x[..., None] * by.frequency.reshape(len(x), *[1] * (x.ndim - 1), -1), slope
         )
@@ -515,13 +536,23 @@ class _Many(NamedTuple):
         (power, swing), (along, rise) = rows.run(_line_rows, given, slopes)
         bins, columns = len(settings.frequency), len(self.along)
         by_power = rows.spread(along[..., :bins], 1, columns)[:, 0]
-        return power[:, 0, :bins], swing[:, 0], by_power, rows.spread(rise, 1, columns)[:, 0]
+        by_swing = rows.spread(rise, 1, columns)[:, 0]
+        return (power[:, 0, :bins], by_power), (swing[:, 0], by_swing)
 
-    def _enveloped(self, seen: "_Seen") -> tuple[np.ndarray, ...]:
+    def tables(self, frequency: Float[np.ndarray, " lines"]) -> tuple[LineTable, LineTable]:
+        """What a line of each frequency [Hz] comes to, and its slopes with respect to it."""
+        settings = self.sampled.settings
+        segments = _arrays_of(settings, self.sampled.window)[1]
+        segments = as_arrays(segments) if isinstance(segments, Segments) else segments
+        sampling = settings.sampling, self.sampled.samples
+        return _in_calls(lambda f, n: _line_tables(f, n, segments, *sampling), frequency)
+
+    def _enveloped(self, seen: "_Seen") -> tuple[Any, Any]:
         sampled = self.sampled.settings, self.sampled.window
         program = functools.partial(_enveloped, sampled)
-        found, slopes = self._run(program, seen.here, ("harmonic",), seen.whole, seen.near)
-        return *found, *slopes
+        found, slopes = self.about(program, seen.here, ("harmonic",), seen.whole, seen.near)
+        (power, swing), (by_power, by_swing) = found, slopes
+        return (power, by_power), (swing, by_swing)
 
 
 class _Group(NamedTuple):
@@ -569,8 +600,9 @@ class _Seen(NamedTuple):
     def alone(self) -> Chain:
         """All parts of a single point in one shape."""
         parts = [group.parts for group in self.groups]
-        size = max(x.matrix.shape[-1] for x in parts)
-        channels = max(x.rows.shape[2] for x in parts)
+        states, most = len(self.near.point.system.A[0]) + SIZES[-1][0], SIZES[0][1]
+        size = max(states, *(x.matrix.shape[-1] for x in parts))
+        channels = max(most, *(x.rows.shape[2] for x in parts))
         each = [group.alone(size, channels) for group in self.groups]
         return jax.tree.map(lambda *x: np.concatenate(x), *each)
 
@@ -587,7 +619,7 @@ def variation_sd_of_numbers(task: AbstractTask, sampled: Sampling, lags: int) ->
     sampled = sampled._replace(samples=as_arrays(sampled.samples, int))
     many, settings = _Many(task, (), (), sampled), sampled.settings
     seen = many.seen(np.zeros((1, 0)))
-    swing = many.line(seen)[1][0]
+    swing = many.line(seen)[1][0][0]
     alone = seen.alone()
     parts = len(alone.matrix)
     every = np.arange(-(-parts // 8) * 8)  # a program for 8, 16 ...

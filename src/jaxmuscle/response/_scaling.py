@@ -19,7 +19,7 @@ from jaxmuscle.spectra._settings import WINDOW
 
 from ._expected import Moments
 from ._expected_moments import expected_moments
-from ._linearised import check_equilibrium, check_inputs
+from ._linearised import check_equilibrium, check_inputs, linearise
 from ._second_order import warn_beyond
 
 FORCES = ("P_w", "F_ext")
@@ -147,7 +147,7 @@ def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
             f"the output of {type(task).__name__} is {task.output_name} in {task.output_unit}, not"
             " a force"
         )
-    here = _moments(task).mean
+    here = _mean(task)
     require(
         abs(here) > NO_FORCE,
         "the mean force of this task is zero, and stays so: give it a P_w or F_ext",
@@ -319,6 +319,14 @@ def _with_variation(task: AbstractTask, before: AbstractTask, factor: Scalar) ->
     else:
         louder = jnp.where(moving, factor * then / jnp.where(moving, now, 1.0), 1.0)
     return task.replace(**{name: task[name] * louder for name in amplitude_names(task)})
+
+
+def _mean(task: AbstractTask) -> Scalar:
+    """Expected mean of the output."""
+    if not all_concrete(task):
+        return linearise(task).rest
+    with jax.enable_x64(True):
+        return as_numbers(linearise(as_doubles(task)).rest)
 
 
 def _moments(task: AbstractTask) -> Moments:

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._parameters import INPUTS
 from jaxmuscle.model._tasks import PrescribedLength
-from jaxmuscle.response._equilibrium import HOLD, equilibrium, fastest_rate
+from jaxmuscle.response._equilibrium import HOLD, equilibrium, fastest_rate, mechanics
 
 from ._grid import parts_for
 
@@ -38,11 +37,12 @@ def driven(
     times = motion.shape[1]
     filled = np.pad(motion, ((0, 0), (0, -(times - 1) % BLOCK)))
     parts = min(parts_for(fastest_rate(task, HOLD), 2 * interval, LONGEST), MOST)
-    return np.asarray(_driven(as_arrays(task), filled, 2 * interval, parts))[: (times + 1) // 2]
+    force = _driven(mechanics(task), filled, 2 * interval, np.asarray(parts))
+    return np.asarray(force)[: (times + 1) // 2]
 
 
 @kept
-def _driven(task: Any, motion: Any, step: Any, parts: int) -> Float[Array, " steps"]:
+def _driven(task: Any, motion: Any, step: Any, parts: Any) -> Float[Array, " steps"]:
     t, start = jnp.asarray(HOLD, motion.dtype), equilibrium(task)
     still, rest = jnp.zeros(len(INPUTS), motion.dtype), task.insertion(t)[0].astype(motion.dtype)
 
@@ -56,17 +56,15 @@ def _driven(task: Any, motion: Any, step: Any, parts: int) -> Float[Array, " ste
         def along(s):
             return first + s * (last - first + bend * (s - 1))
 
-        def part(y, begin):
+        def part(i, y):
+            begin = i / parts
             a = at(y, along(begin))[0]
             b = at(y + 0.5 * short * a, along(begin + 0.5 / parts))[0]
             c = at(y + 0.5 * short * b, along(begin + 0.5 / parts))[0]
             d = at(y + short * c, along(begin + 1 / parts))[0]
-            return y + short / 6 * (a + 2 * b + 2 * c + d), None
+            return y + short / 6 * (a + 2 * b + 2 * c + d)
 
-        return (
-            jax.lax.scan(part, y, jnp.arange(parts, dtype=motion.dtype) / parts)[0],
-            at(y, first)[1],
-        )
+        return jax.lax.fori_loop(0, parts, part, y), at(y, first)[1]
 
     table, short = motion.T, step / parts
     y, found = jax.lax.scan(advance, start, (table[:-1:2], table[1::2], table[2::2]))
