@@ -10,14 +10,13 @@ import scipy.stats
 from refits import without_intervals
 
 import jaxmuscle as jm
-from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits._adequacy import Endpoint, _misfit, elsewhere
 from jaxmuscle.fits._intervals import intervals
 from jaxmuscle.fits._refit import without_fitted
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._consequences import consequences, expand, quantities
-from jaxmuscle.response._harmonic_line import line_levels
+from jaxmuscle.response._rows import line_levels
 from jaxmuscle.spectra._bin_law import bin_statistics
 
 TASK = jm.Isometric()
@@ -98,7 +97,7 @@ def test_a_line_in_the_bins_is_that_of_a_sine(x64):
         phases = 2 * np.pi * np.arange(16)[:, None] / 16
         sines = np.sqrt(2) * np.sin(2 * np.pi * frequency * time + phases)
         seen = np.asarray(jm.spectra.spectrum_of(sines, settings).power).mean(axis=0)
-        level = np.asarray(line_levels(as_arrays(plain), settings, np.array([frequency]))[0][0])
+        level = np.asarray(line_levels(plain, settings, np.array([frequency]))[0][0])
         np.testing.assert_allclose(level, seen, rtol=1e-6, atol=1e-9 * seen.max())
 
 

@@ -265,6 +265,14 @@ def test_a_seed_is_the_same_whatever_the_batch(task, precision):
             )
 
 
+@pytest.mark.parametrize("samples", [131_200, 150_001])
+def test_long_runs_in_single_precision_reach_their_end(samples):
+    """A hundred units in the last place of so many steps are more than one step."""
+    run = jm.simulate(jm.settled(jm.Isometric()), KEY, duration=samples / 1000, rate=1000.0)
+    assert run.output.dtype == np.float32 and len(run.output) == samples + 1
+    assert np.all(np.isfinite(run.output))
+
+
 def test_single_precision_follows_double():
     task = references.quiet(jm.PrescribedForce(5.0, 1.0))
     single = jm.simulate(task, KEY)
