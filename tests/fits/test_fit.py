@@ -328,7 +328,7 @@ class Direct(eqx.Module):
     data: None = None
     linear: bool = eqx.field(static=True, default=False)
     optimiser: None = None
-    moving: np.ndarray = eqx.field(default_factory=lambda: np.ones(2))
+    moving: np.ndarray = eqx.field(default_factory=lambda: np.ones(1))
 
     @property
     def parts(self):
@@ -359,6 +359,7 @@ class Curved(Direct):
     -1.5."""
 
     scale: float = 10.0
+    moving: np.ndarray = eqx.field(default_factory=lambda: np.ones(2))
 
     def values(self, theta):
         valley = jnp.stack(
