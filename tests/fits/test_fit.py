@@ -25,13 +25,14 @@ from jaxmuscle.fits._checks import AMBIGUOUS, Stage, rivals
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import BASE, DEFAULT_FREE, PARAMETERS
 from jaxmuscle.model._stream import Draws
-from jaxmuscle.objective._arguments import DT, RESIDUALS, FitOptions, free_names, planned
+from jaxmuscle.objective._arguments import free_names, planned
 from jaxmuscle.objective._consequences import BATCH, consequences, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import common_scales, identifiability
 from jaxmuscle.objective._derived import of_spectrum
 from jaxmuscle.objective._least_squares import Minima, _residuals, _Standing, least_squares
 from jaxmuscle.objective._moment_models import MonteCarlo, welch_operator
+from jaxmuscle.objective._options import DT, FitOptions
 from jaxmuscle.objective._problem import FitProblem, Part, target_variation
 from jaxmuscle.objective._residuals import data_residuals, further_residuals, residual_sigma
 from jaxmuscle.objective._starts import contenders, halton

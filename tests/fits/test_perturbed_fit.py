@@ -17,8 +17,8 @@ from scipy.optimize import brentq
 import jaxmuscle as jm
 from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._perturbed import alike, seen_with, without_rhythm
-from jaxmuscle.objective._arguments import FitOptions
 from jaxmuscle.objective._consequences import expand
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.uncertainty import _posterior
 from jaxmuscle.uncertainty._chains import Chains
 from jaxmuscle.uncertainty._identifiability import fitted_problem

@@ -245,9 +245,8 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
         return _in_memory(layout, tell)
 
 
-def runs_for_means(task: AbstractTask, key: Key, seeds: int, draws: Draws) -> Trajectory:
-    """Seeds 0 to seeds - 1 as `ensemble` simulates them, with weak numbers, too: for means over the
-    seeds alone.
+def runs_for_means(task: AbstractTask, key: Key, seeds: int) -> Trajectory:
+    """Seeds 0 to seeds - 1 as `ensemble` simulates them.
 
     `AT_ONCE` of them at once: one program for any number, and each core of a CPU has some.
     """
@@ -263,7 +262,7 @@ def runs_for_means(task: AbstractTask, key: Key, seeds: int, draws: Draws) -> Tr
         cut=cut,
         states=True,
         spectrum=False,
-        draws=draws,
+        draws=Draws(),
         threads=None,
     )
     found = _in_memory(layout, lambda pace: None)

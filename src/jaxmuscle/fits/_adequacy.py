@@ -298,7 +298,7 @@ def _drawn(objective: Residuals, scatter: np.ndarray, generator: np.random.Gener
     start = 0
     for part in objective.parts:
         bins = len(part.statistics.sd)
-        if part.residual == "log" and objective.linear and bins:
+        if objective.linear and bins:
             drawn[:, start : start + bins] = drawn_log_residuals(part, generator, REPLICATES)
         start += _rows_of(part)
     return drawn
@@ -311,8 +311,7 @@ def rows_of(ended: Endpoint) -> list[slice]:
 
 
 def _rows_of(part: PartResiduals) -> int:
-    bins = len(part.statistics.sd) - (part.residual == "cumulative")
-    return bins + part.data.further
+    return len(part.statistics.sd) + part.data.further
 
 
 def _misfit(
@@ -323,8 +322,6 @@ def _misfit(
 
     No bin in it is off by more than one standard deviation the other way.
     """
-    if problem.residual == "cumulative":
-        return ""
     whose = {
         part.name: f"{part.name} has" if len(problem.parts) > 1 else "the data have"
         for part in problem.parts

@@ -8,7 +8,7 @@ from msgspec import Meta
 from jaxmuscle._common.documents import Table, says
 from jaxmuscle._common.keys import SEEDS
 from jaxmuscle.data._target import Target
-from jaxmuscle.objective._arguments import METHODS, RESIDUALS
+from jaxmuscle.objective._options import METHODS
 from jaxmuscle.objective._starts import SPREAD
 
 FORMAT = 5
@@ -119,7 +119,6 @@ class SettingsTable(Table, kw_only=True):
     fit."""
 
     free: Annotated[list[str], says("Names of the fitted parameters")]
-    residual: Annotated[Literal[RESIDUALS], says("How powers were compared, see docs/fitting.md")]  # pyright: ignore[reportInvalidTypeForm]
     prior_centre: Annotated[
         dict[str, float], says("Centre of the prior of every free parameter, in its unit")
     ]
@@ -140,13 +139,6 @@ class SettingsTable(Table, kw_only=True):
         Count, says("Largest number of steps that one search from a starting point may take")
     ]
     dt: Annotated[Annotated[float, Meta(gt=0)], says("Step of the noise [s]")]
-    increments: Annotated[
-        Literal["gaussian", "weak"],
-        says(
-            "Random numbers of the simulations: normal ones, or the cheaper ones of docs/engine.md",
-            missing="`gaussian`",
-        ),
-    ] = "gaussian"
     coefficient_of_variation: Annotated[
         bool | dict[str, bool], says("Whether it was data; of several targets by name")
     ]
@@ -171,9 +163,6 @@ class SettingsTable(Table, kw_only=True):
     ]
     spectrum: Annotated[dict[str, Any], says("Spectrum settings; of several targets by name")]
     steps_per_sample: Annotated[Count, says("Steps of dt between samples")]
-    optimiser: Annotated[
-        str | None, says("Solver; null for Levenberg-Marquardt", missing="Levenberg-Marquardt")
-    ] = None
     separate: Annotated[
         tuple[str, ...],
         says("Parameters with a value for each target", missing="fit of one target"),

@@ -60,9 +60,9 @@ def intervals(
     errors of this quantity are widened (`widening`, of every name). Positive quantities move in
     their logarithm. All at once.
 
-    Of fits in linear response with log residuals only (empty otherwise).
+    Of fits in linear response only (empty otherwise).
     """
-    if not objective.linear or problem.residual != "log":
+    if not objective.linear:
         return {}
     found: dict[str, Interval] = {}
     # a row that runs away is an open end

@@ -14,9 +14,10 @@ from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.model._resonant_noise import narrow_resonances
 from jaxmuscle.model._rungs import QUIET, RICHER, rung_name
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._arguments import FitOptions, Plan
+from jaxmuscle.objective._arguments import Plan
 from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import log_marginal, measured_bins
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._starts import (
     continued,
     kinds_of_starts,

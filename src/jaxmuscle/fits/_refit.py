@@ -82,7 +82,7 @@ def refit_of(
     jacobian, turn = _narrowed(objective, found.jacobian)
     found = found._replace(residuals=turn.T @ found.residuals, jacobian=jacobian)
     power, line = np.asarray(moments.power), np.asarray(moments.line)
-    alone = len(problem.parts) == 1 and len(free) == 2 and problem.residual == "log"
+    alone = len(problem.parts) == 1 and len(free) == 2
     if not (alone and np.all(power > line) and np.any(line > 0)):
         taken = taken_up(np.concatenate([found.jacobian, prior]))[None]
         return Refit(
@@ -146,9 +146,7 @@ def _narrowed(
     turns, start = [], 0
     for part in objective.parts:
         points = 0 if part.model.points is None else 2 * len(part.model.points)
-        rows = (
-            part.data.further - points + len(part.statistics.sd) - (part.residual == "cumulative")
-        )
+        rows = part.data.further - points + len(part.statistics.sd)
         turns.append(np.eye(rows))
         start += rows
         if points:

@@ -345,7 +345,7 @@ def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moment
     if not len(part.target.bins):
         return part.ones
     try:
-        runs = runs_for_means(settled(task), fold_in(problem.key, 2), problem.seeds, problem.draws)
+        runs = runs_for_means(settled(task), fold_in(problem.key, 2), problem.seeds)
     except (SimulationError, ValueError):
         return None  # the check on fresh seeds meets the same error and reports it
     each, expected = controlled_moments(runs, part.target, task)

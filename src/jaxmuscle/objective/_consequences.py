@@ -226,14 +226,13 @@ def _of_spectra(
     )
     settings = part.task.settings
     given = as_arrays((settings.frequency[part.model.chosen], settings.resolution))
-    program = functools.partial(_spectra, part.residual, part.data, *given)
+    program = functools.partial(_spectra, part.data, *given)
     values, slopes = in_parts(program, filled(seen.moments), slopes, np.stack(peaks, axis=1))
     return values, jax.tree.map(lambda x: x[..., :free], slopes)
 
 
 @kept
 def _spectra(
-    residual: str,
     data: Data,
     frequency: Float[Array, " bins"],
     resolution: Float[Array, ""],
@@ -245,7 +244,7 @@ def _spectra(
         def found(away):
             near = jax.tree.map(lambda x, slope: x + slope @ away, moments, slopes)
             return (
-                data_residuals(residual, near, data),
+                data_residuals(near, data),
                 of_spectrum(near, frequency, resolution, peaks),
             )
 
