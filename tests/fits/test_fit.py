@@ -329,6 +329,7 @@ class Direct(eqx.Module):
     data: None = None
     linear: bool = eqx.field(static=True, default=False)
     optimiser: None = None
+    moving: np.ndarray = eqx.field(default_factory=lambda: np.ones(2))
 
     @property
     def parts(self):

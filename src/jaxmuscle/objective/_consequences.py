@@ -265,9 +265,9 @@ def expand(
 ) -> Expansion:
     """The moments of every part and their slopes at every θ, as numbers; without `slopes`, and
     along what is not moving, these are not computed, and zero."""
-    moving = np.asarray(objective.moving) > 0
+    moving = np.asarray(objective.moving) * slopes
     each = [
-        _expanded(part, np.asarray(objective.own(theta, i)), slopes & objective.own(moving, i))
+        _expanded(part, np.asarray(objective.own(theta, i)), objective.own(moving, i) > 0)
         for i, part in enumerate(objective.parts)
     ]
     spread = objective.spread  # asked for once: every time it makes an object
