@@ -94,7 +94,6 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "seed": 3,
         "settings": {
             "free": ["k_w", "c_w"],
-            "residual": "log",
             "prior_centre": {"k_w": 5e5, "c_w": 60.0},
             "prior_sd": {"k_w": 1.0, "c_w": None},
             "bounds": {"k_w": [1.0, 2e6]},

@@ -70,7 +70,6 @@ def fitted(
     )
     table = {
         "free": list(free),
-        "residual": "log",
         "mean_force": None,
         "bounds": {},
         "starts": 1,

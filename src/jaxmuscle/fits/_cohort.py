@@ -278,6 +278,7 @@ def fit_cohort(
 
     **Raises:** `ValueError` for no targets, equal names and a group of an unknown target.
     """
+    asked = FitOptions.of(fit_cohort, SearchOptions, {"starts": 32, **options})
     loaded, failed = _loaded(targets, on_rung(PrescribedLength(), rung) if rung else None)
     unknown = set(groups or {}) - set(loaded) - set(failed)
     if unknown:
@@ -285,7 +286,6 @@ def fit_cohort(
             f"groups: no target is called {', '.join(sorted(unknown))}; there are"
             f" {', '.join(loaded)}"
         )
-    asked = FitOptions.of(fit_cohort, SearchOptions, {"starts": 32, **options})
     results: dict[str, FitResult] = {}
     with told(progress, f"fitting {len(loaded)} targets") as tell, fitting():
         batches: dict[Any, dict[str, Plan]] = {}
