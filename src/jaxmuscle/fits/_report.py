@@ -48,9 +48,9 @@ from ._checks import (
     twitch_notices,
     unsettled,
 )
+from ._fit_file import Rung, Start
 from ._harmonic_evidence import harmonic_test
-from ._ladder import Rung
-from ._part import FittedPart, Start
+from ._part import FittedPart
 from ._peaks import find_unseen
 from ._result import FitResult
 from ._tables import (
