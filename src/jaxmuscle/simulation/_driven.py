@@ -44,6 +44,7 @@ def driven(
 @kept
 def _driven(task: Any, motion: Any, step: Any, parts: Any) -> Float[Array, " steps"]:
     t, start = jnp.asarray(HOLD, motion.dtype), equilibrium(task)
+    cut = parts.astype(motion.dtype)
     still, rest = jnp.zeros(len(INPUTS), motion.dtype), task.insertion(t)[0].astype(motion.dtype)
 
     def at(y, row):
@@ -57,16 +58,16 @@ def _driven(task: Any, motion: Any, step: Any, parts: Any) -> Float[Array, " ste
             return first + s * (last - first + bend * (s - 1))
 
         def part(i, y):
-            begin = i / parts
+            begin = i.astype(cut.dtype) / cut
             a = at(y, along(begin))[0]
-            b = at(y + 0.5 * short * a, along(begin + 0.5 / parts))[0]
-            c = at(y + 0.5 * short * b, along(begin + 0.5 / parts))[0]
-            d = at(y + short * c, along(begin + 1 / parts))[0]
+            b = at(y + 0.5 * short * a, along(begin + 0.5 / cut))[0]
+            c = at(y + 0.5 * short * b, along(begin + 0.5 / cut))[0]
+            d = at(y + short * c, along(begin + 1 / cut))[0]
             return y + short / 6 * (a + 2 * b + 2 * c + d)
 
         return jax.lax.fori_loop(0, parts, part, y), at(y, first)[1]
 
-    table, short = motion.T, step / parts
+    table, short = motion.T, step / cut
     y, found = jax.lax.scan(advance, start, (table[:-1:2], table[1::2], table[2::2]))
     force = jnp.append(found, at(y, table[-1])[1])
     return force - at(start, jnp.zeros(3, motion.dtype))[1]
