@@ -16,7 +16,8 @@ from jaxmuscle._common.text import listed
 from jaxmuscle._common.types import Key, Seeds
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._task import AbstractTask, require_task
-from jaxmuscle.response._linearised import LinearTask
+from jaxmuscle.response._linear_task import LinearTask
+from jaxmuscle.response._linearised import linearise
 from jaxmuscle.simulation._simulate import DT, DURATION, require_finite, trajectories
 from jaxmuscle.simulation._trajectory import Trajectory
 
@@ -205,7 +206,7 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
                 "under a JAX transformation an ensemble can be of one task, in memory: no sweep,"
                 " reduce or store"
             )
-        linear = LinearTask.of(as_arrays(task)) if control else None
+        linear = LinearTask.of(as_arrays(task), linearise(task)) if control else None
         return trajectories(task, linear, key, jnp.asarray(np.asarray(numbers)), plan, draws=draws)
     linear = companions(task, duration, control)
     kept = levels is not None or store is not None

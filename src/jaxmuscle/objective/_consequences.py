@@ -16,7 +16,7 @@ from jaxmuscle.model._parameters import paths_of, set_parameters
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.response._linearised import Near, in_parts, value_and_slopes
+from jaxmuscle.response._mechanics import Near, in_parts, value_and_slopes
 from jaxmuscle.response._rows import mechanical_rows
 from jaxmuscle.response._transfer import half_power_level
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmuscle._common.programs import kept
-from jaxmuscle.response._linearised import in_parts
+from jaxmuscle.response._mechanics import in_parts
 
 from ._consequences import Expansion, expand
 from ._residuals import free_size

@@ -15,7 +15,8 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments, response
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._input_response import parts_of_stiffness
-from jaxmuscle.response._linearised import LinearTask, settled
+from jaxmuscle.response._linear_task import LinearTask
+from jaxmuscle.response._linearised import settled
 from jaxmuscle.response._rows import Sampling, moments_of_rows
 from jaxmuscle.simulation._batch import streams_of
 from jaxmuscle.simulation._grid import Grid

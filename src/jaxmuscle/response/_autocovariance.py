@@ -17,7 +17,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._decimation import FINER, REACH, anti_alias
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from ._linearised import Linearisation, balanced
+from ._linear_task import Linearisation, balanced
 
 SHORT = 4  # doublings: blocks of sixteen, about the root of the points of the low-pass
 KINK = 10  # values of r from lag 0 on that say what its kink does to a sum
