@@ -30,7 +30,7 @@ from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import common_scales, identifiability
 from jaxmuscle.objective._derived import of_spectrum
 from jaxmuscle.objective._least_squares import Minima, _residuals, _Standing, least_squares
-from jaxmuscle.objective._moment_models import MonteCarlo, welch_operator
+from jaxmuscle.objective._moment_models import Linear, MonteCarlo, welch_operator
 from jaxmuscle.objective._options import DT, FitOptions
 from jaxmuscle.objective._problem import FitProblem, Part, target_variation
 from jaxmuscle.objective._residuals import data_residuals, further_residuals
@@ -156,7 +156,8 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task):
     quiet = np.asarray(jm.ensemble(task.replace(**still), key, seeds=seeds, dt=dt).output)[0]
     grid = Grid(dt, 6000, 4, runs.substeps)
     chosen = np.array([0, 3, 10, 29])
-    model = MonteCarlo.of(task.settings, key, seeds, grid, chosen, WINDOW, control=False)
+    linear = Linear(chosen, Moments(*[np.ones(4)] * 2, *[np.ones(())] * 2), np.array(1000), WINDOW)
+    model = MonteCarlo.of(linear, task.settings, key, seeds, grid, control=False)
     moments = drawing(lambda task: model.moments(task))(as_arrays(task))
 
     def powers(signal):

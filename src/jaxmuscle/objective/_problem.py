@@ -147,14 +147,14 @@ class Part:
         self, share: np.ndarray | None = None, correction: Moments | None = None
     ) -> PartResiduals:
         """Its residuals in linear response, times a correction of its moments."""
+        return self.residuals(self.expected(correction), share)
+
+    def expected(self, correction: Moments | None = None) -> Linear:
+        """The model of its moments in linear response, times a correction."""
         known: Moments = jax.tree.map(np.asarray, self.ones if correction is None else correction)
-        samples, recorded = map(
-            np.asarray,
-            (trial_samples(self.target), recorded_interval(self.target, self.target.settings)),
-        )
-        return self.residuals(
-            Linear(self.chosen, known, samples, WINDOW, self.points, recorded), share
-        )
+        recorded = recorded_interval(self.target, self.target.settings)
+        samples, recorded = np.asarray(trial_samples(self.target)), np.asarray(recorded)
+        return Linear(self.chosen, known, samples, WINDOW, self.points, recorded)
 
     def residuals(self, model: Linear | MonteCarlo, share: np.ndarray | None) -> PartResiduals:
         """Its residuals with a model of its moments; `share` is what a line holds of each bin."""
@@ -335,18 +335,8 @@ class FitProblem:
         settings, every = part.target.settings, self.steps_per_sample
         part.task.check_step(self.dt)
         grid = Grid(self.dt, every * round(DURATION * settings.rate), every, 1, reverse=False)
-        return MonteCarlo.of(
-            settings,
-            jax.random.fold_in(self.key, 0),
-            seeds,
-            grid,
-            part.chosen,
-            WINDOW,
-            control=self.control,
-            samples=trial_samples(part.target),
-            points=part.points,
-            recorded=recorded_interval(part.target, settings),
-        )
+        key = jax.random.fold_in(self.key, 0)
+        return MonteCarlo.of(part.expected(), settings, key, seeds, grid, control=self.control)
 
     def finer(self, objective: Residuals, points: Float[np.ndarray, "points free"]) -> Residuals:
         """The residuals with as many sub-steps as the stiffest of the points asks for; never fewer
