@@ -26,8 +26,9 @@ import jaxmuscle as jm
 from jaxmuscle._common.files import write_json
 from jaxmuscle.fits._search import search_together
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import expand, quantities
+from jaxmuscle.objective._options import FitOptions
 
 PERTURBED = ("noise_K_w", "noise_K_z", "harmonic_amplitude")
 SOFTER = 3.0

@@ -18,7 +18,8 @@ from jaxmuscle.comparison._comparison import NEEDED, Evidence, decided, lowest
 from jaxmuscle.comparison._evidence import Candidate, Folds, held_out, masked_bins, maxima, stacked
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import DEFAULT_FREE
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import FitProblem
 
 COLOURS = ("band-limited", "ornstein-uhlenbeck", "pink")

@@ -8,8 +8,9 @@ import numpy as np
 from measure import Row, seconds
 
 import jaxmuscle as jm
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._least_squares import least_squares
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._starts import starting_points
 
 TARGETS = ("vastus-lateralis-26mvc", "fdi-abduction-45mvc")

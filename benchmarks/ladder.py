@@ -13,8 +13,9 @@ import numpy as np
 from verdict import SETTINGS, STARTS, recordings, run, targets
 
 import jaxmuscle as jm
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import expand, quantities
+from jaxmuscle.objective._options import FitOptions
 
 TASK = jm.Isometric()
 # with the default's floor a tremor of 3 % is a quarter of the power at 9 Hz

@@ -18,8 +18,9 @@ import scipy.stats
 import jaxmuscle as jm
 from jaxmuscle.fits._harmonic_evidence import harmonic_test
 from jaxmuscle.fits._search import _together
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import expand, quantities
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._starts import starting_points
 from jaxmuscle.response._second_order import negative_coefficients, second_order
 from jaxmuscle.spectra._measures import coefficient_of_variation

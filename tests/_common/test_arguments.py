@@ -38,7 +38,6 @@ FIT = {
     ),
     "noise": (3, "nope", True, ["pink"]),
     "method": (3, "x", None, ["linear"]),
-    "residual": (3, "x"),
     "mean_force": (3, True, (1,), ("a", 1), (1, -1), (np.nan, 1), (1, 0)),
     "coefficient_of_variation": (3, "x", None),
 }

@@ -23,9 +23,10 @@ from jaxmuscle.checks._refits import Drawn, refitted
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._search import search_together
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import consequences, expand
 from jaxmuscle.objective._likelihood import Likelihood, drawn_spectra, repeated
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.spectra._bin_law import welch_law
 
 FREE = ("c_w", "noise_K_z")

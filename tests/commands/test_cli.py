@@ -184,7 +184,6 @@ OPTIONS = {
         "--rung: the models with activation",
     ),
     "unknown task": (["{csv}", "--task", "isotonic"], "'--task'"),
-    "unknown residual": (["{csv}", "--residual", "square"], "'--residual'"),
     "unknown method": (["{csv}", "--method", "linaer"], "'--method'"),
     "white noise in the output": (
         ["{csv}", "--noise", "white"],
@@ -701,8 +700,6 @@ def test_options_reach_the_fit(tmp_path, monkeypatch):
         4,
         "--segments",
         7,
-        "--residual",
-        "linear",
     )
     path = csv_file(tmp_path, name="mine.csv")
     assert run("fit", path, "--noise", "white", *fixed, *many, "--out", tmp_path).exit_code == 0
@@ -712,7 +709,6 @@ def test_options_reach_the_fit(tmp_path, monkeypatch):
         "noise": "white",
         "starts": 3,
         "method": "linear",
-        "residual": "linear",
         "seeds": 9,
         "key": 4,
     }

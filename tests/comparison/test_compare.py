@@ -25,8 +25,9 @@ from jaxmuscle.comparison import _compare, _evidence
 from jaxmuscle.comparison._comparison import COLUMNS, Evidence, decided
 from jaxmuscle.comparison._evidence import Candidate, Folds, effective_numbers, without_harmonic
 from jaxmuscle.model._noises import with_noise
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._likelihood import log_density, log_likelihood, measured_bins
+from jaxmuscle.objective._options import FitOptions
 
 FREE = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency", "noise_correlation_time")
 COLOURS = ("band-limited", "ornstein-uhlenbeck", "pink")

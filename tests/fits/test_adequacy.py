@@ -14,8 +14,9 @@ from jaxmuscle.fits._adequacy import Endpoint, _misfit, elsewhere
 from jaxmuscle.fits._intervals import intervals
 from jaxmuscle.fits._refit import without_fitted
 from jaxmuscle.model._parameters import DEFAULT_FREE
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import consequences, expand, quantities
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.response._rows import line_levels
 from jaxmuscle.spectra._bin_law import bin_statistics
 

@@ -6,7 +6,7 @@ import pytest
 import scipy.stats
 
 from jaxmuscle.fits._checks import convergence, linear_check
-from jaxmuscle.fits._part import Start
+from jaxmuscle.fits._fit_file import Start
 from jaxmuscle.objective._covariance import Identifiability
 from jaxmuscle.objective._least_squares import Minima
 from jaxmuscle.spectra._bin_law import BinStatistics
@@ -22,7 +22,7 @@ def cost_of(residuals, prior, theta):
 def told(residuals, jacobian, prior, theta, known=DETERMINED, settled=False, starts=()):
     cost = cost_of(residuals, prior, theta)
     final = Minima(theta[None], np.array([cost]), np.array([64]), np.array([settled]))
-    starts = starts or (Start(cost, False, 64),)
+    starts = starts or (Start(cost, False, 64, ()),)
     return convergence(final, residuals, jacobian, np.diag(prior), theta, known, starts, 64)
 
 
@@ -101,6 +101,6 @@ def test_the_linear_response_against_fresh_seeds():
 def test_only_two_kinds_of_start_at_one_minimum_are_called_converged(quadratic, ended, words):
     residuals, jacobian, prior, theta, _ = quadratic
     each = (start.split() for start in ended.split(", "))
-    starts = tuple(Start(float(cost), True, 9, kind=kind) for kind, cost in each)
+    starts = tuple(Start(float(cost), True, 9, (), kind) for kind, cost in each)
     success, message = told(residuals, jacobian, prior, theta, settled=True, starts=starts)
     assert success and message.startswith(words)

@@ -24,22 +24,21 @@ from jaxmuscle.fits import _search
 from jaxmuscle.fits._checks import AMBIGUOUS, Stage, rivals
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import BASE, DEFAULT_FREE, PARAMETERS
-from jaxmuscle.model._stream import Draws
-from jaxmuscle.objective._arguments import DT, RESIDUALS, FitOptions, free_names, planned
+from jaxmuscle.objective._arguments import free_names, planned
 from jaxmuscle.objective._consequences import BATCH, consequences, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import common_scales, identifiability
 from jaxmuscle.objective._derived import of_spectrum
 from jaxmuscle.objective._least_squares import Minima, _residuals, _Standing, least_squares
-from jaxmuscle.objective._moment_models import MonteCarlo, welch_operator
+from jaxmuscle.objective._moment_models import Linear, MonteCarlo, welch_operator
+from jaxmuscle.objective._options import DT, FitOptions
 from jaxmuscle.objective._problem import FitProblem, Part, target_variation
-from jaxmuscle.objective._residuals import data_residuals, further_residuals, residual_sigma
+from jaxmuscle.objective._residuals import data_residuals, further_residuals
 from jaxmuscle.objective._starts import contenders, halton
 from jaxmuscle.response._equilibrium import slowest_rate
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._rows import _noise_rows
 from jaxmuscle.simulation._grid import Grid
-from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
 
 PERTURBATION = (
@@ -62,9 +61,7 @@ def simple_target(**fields: Any) -> jm.Target:
     return jm.Target("hump", power / power.sum(), **{"segments": 12, **fields})
 
 
-def setup_of(
-    task, target, free, *, residual="log", extra=(None, None), seeds=8, key=0, control=False
-):
+def setup_of(task, target, free, *, extra=(None, None), seeds=8, key=0, control=False):
     """What `fit` makes of its arguments, for one objective without a search. Needs float64."""
     values = {name: float(task[name]) for name in free}
     coordinates = Coordinates.of(values, {}, {name: PARAMETERS[name].prior_sd for name in free})
@@ -73,7 +70,6 @@ def setup_of(
         (part,),
         coordinates,
         np.ones(len(free)),
-        residual,
         "montecarlo",
         DT,
         jax.random.key(key),
@@ -160,7 +156,8 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task):
     quiet = np.asarray(jm.ensemble(task.replace(**still), key, seeds=seeds, dt=dt).output)[0]
     grid = Grid(dt, 6000, 4, runs.substeps)
     chosen = np.array([0, 3, 10, 29])
-    model = MonteCarlo.of(task.settings, key, seeds, grid, chosen, WINDOW, control=False)
+    linear = Linear(chosen, Moments(*[np.ones(4)] * 2, *[np.ones(())] * 2), np.array(1000), WINDOW)
+    model = MonteCarlo.of(linear, task.settings, key, seeds, grid, control=False)
     moments = drawing(lambda task: model.moments(task))(as_arrays(task))
 
     def powers(signal):
@@ -327,7 +324,6 @@ class Direct(eqx.Module):
     model: None = None
     data: None = None
     linear: bool = eqx.field(static=True, default=False)
-    optimiser: None = None
     moving: np.ndarray = eqx.field(default_factory=lambda: np.ones(1))
 
     @property
@@ -440,20 +436,17 @@ FREE = ("c_w", "noise_K_w", "harmonic_frequency")
 
 
 @functools.cache
-def _problem(residual, extra=(None, None)):
+def _problem(extra=(None, None)):
     with jax.enable_x64(True):
-        return setup_of(
-            jm.Isometric(), simple_target(), FREE, residual=residual, extra=extra
-        ).montecarlo(8)
+        return setup_of(jm.Isometric(), simple_target(), FREE, extra=extra).montecarlo(8)
 
 
 EXTRA, AT = ((np.log(0.02), 0.1), (2.0, 0.1)), np.array([0.2, -0.1, 0.05])
 
 
 def _at(theta):
-    """The model of all these objectives, by one program: residuals of every kind follow from its
-    moments."""
-    return expand(_problem("log", EXTRA), np.asarray(theta)[None]).row(0)
+    """The model of all these objectives, by one program."""
+    return expand(_problem(EXTRA), np.asarray(theta)[None]).row(0)
 
 
 def _moments(theta):
@@ -462,12 +455,11 @@ def _moments(theta):
 
 @functools.cache
 def _seen():
-    return _at(_problem("log", EXTRA).theta(jnp.asarray(AT)))
+    return _at(_problem(EXTRA).theta(jnp.asarray(AT)))
 
 
-@pytest.mark.parametrize("residual", RESIDUALS)
-def test_gradients_of_the_residuals_are_differences(x64, residual):
-    objective, s, seen = _problem(residual, EXTRA), jnp.asarray(AT), _seen()
+def test_gradients_of_the_residuals_are_differences(x64):
+    objective, s, seen = _problem(EXTRA), jnp.asarray(AT), _seen()
 
     def evaluate(s):
         theta = objective.theta(s)
@@ -482,14 +474,13 @@ def test_gradients_of_the_residuals_are_differences(x64, residual):
     # Truncation h² times the third derivative, which for a line crossing a bin is up to 1e2 of the
     # slope.
     np.testing.assert_allclose(forward, central, rtol=1e-5, atol=1e-5 * np.abs(central).max())
-    bins = 29 if residual == "cumulative" else 30
-    assert forward.shape == (bins + 2 + 3, 3)
+    assert forward.shape == (30 + 2 + 3, 3)
 
 
 def test_slopes_that_were_seen_are_those_of_the_whole(x64):
     """Every batch of points has one program for moments and slopes; here the residuals are
     differentiated in one piece."""
-    objective, s, seen = _problem("log", EXTRA), jnp.asarray(AT), _seen()
+    objective, s, seen = _problem(EXTRA), jnp.asarray(AT), _seen()
 
     def whole(s):
         theta = objective.theta(s)
@@ -502,7 +493,7 @@ def test_slopes_that_were_seen_are_those_of_the_whole(x64):
 
 
 def test_the_extra_residuals_are_log_variation_and_mean(x64):
-    (objective,) = _problem("log", EXTRA).parts
+    (objective,) = _problem(EXTRA).parts
     moments = _moments(jnp.zeros(3))
     rows = further_residuals(moments, objective.data)
     expected = [np.log(float(moments.variation) / 0.02) / 0.1, (float(moments.mean) - 2.0) / 0.1]
@@ -510,35 +501,11 @@ def test_the_extra_residuals_are_log_variation_and_mean(x64):
 
 
 def test_the_residuals_vanish_for_a_target_that_the_model_makes(x64):
-    for residual in RESIDUALS:
-        (objective,) = _problem(residual).parts
-        moments = _moments(jnp.zeros(3))
-        bias = np.exp(objective.statistics.bias) if residual == "log" else 1.0
-        made = eqx.tree_at(lambda p: p.data.target, objective, moments.proportional * bias)
-        np.testing.assert_allclose(data_residuals(residual, moments, made.data), 0.0, atol=1e-12)
-        shifted = data_residuals(residual, _moments(jnp.full(3, 0.2)), made.data)
-        assert np.abs(shifted).max() > 0.1
-
-
-def test_linear_and_cumulative_residuals_are_in_standard_deviations(x64):
-    """Of simulated spectra about their expectation, p_k and its running sum."""
-    segments = 12
-    target = simple_target(segments=segments)
-    statistics = bin_statistics(target)
-    rng = np.random.default_rng(1)
-    # Gaussian signals of that spectrum, by shaping white noise.
-    n = 256 + 11 * 128
-    density = np.interp(np.fft.rfftfreq(8 * n, 0.01), target.frequency, target.proportional_power)
-    x = np.fft.irfft(np.fft.rfft(rng.standard_normal((500, 8 * n))) * np.sqrt(density))[:, :n]
-    power = np.asarray(
-        jm.spectra.spectrum_of(x, target.settings.replace(filter_cutoff="none")).power
-    )
-    p = power / power.sum(axis=1, keepdims=True)
-    for kind, value in (("linear", p), ("cumulative", np.cumsum(p, axis=1))):
-        ratio = value.std(axis=0) / residual_sigma(kind, target, statistics)
-        # A linear theory of shares whose largest has a relative error of 0.3, of bins that are not
-        # quite flat.
-        np.testing.assert_allclose(ratio[:-1], 1.0, atol=0.25)
+    (objective,) = _problem().parts
+    moments, bias = _moments(jnp.zeros(3)), np.exp(objective.statistics.bias)
+    made = eqx.tree_at(lambda p: p.data.target, objective, moments.proportional * bias)
+    np.testing.assert_allclose(data_residuals(moments, made.data), 0.0, atol=1e-12)
+    assert np.abs(data_residuals(_moments(jnp.full(3, 0.2)), made.data)).max() > 0.1
 
 
 def null_sentences(task, extra):
@@ -654,7 +621,6 @@ def test_free_by_default():
     ("arguments", "message"),
     [
         ({"method": "linaer"}, "method = 'linaer'.*did you mean 'linear'"),
-        ({"residual": "logs"}, "residual = 'logs': did you mean 'log'"),
         ({"noise": "pinkish"}, "noise = 'pinkish': .*band-limited"),
         ({"starts": 0}, "starts = 0: give a whole number from 1"),
         ({"seeds": -1}, "seeds = -1: give a whole number from 0"),
@@ -670,13 +636,27 @@ def test_free_by_default():
             {"free": ["c_w"], "bounds": {"c_w": (1.0, 2.0)}},
             "c_w = 60.0 .* must lie inside its bounds",
         ),
-        ({"increments": "strong"}, r"increments = 'strong': .*gaussian.*weak"),
         ({"dt": 3e-3}, "dt = 0.003 s does not divide the sampling interval 0.01"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         jm.fit(jm.Isometric(), simple_target(), **arguments)
+
+
+@pytest.mark.parametrize(
+    "function, given, message",
+    [
+        (jm.fit, "metod", "did you mean 'method'"),
+        (jm.problem, "starts", "known are bounds"),
+    ],
+)
+def test_an_unknown_option_is_named_with_the_nearest(function, given, message):
+    with pytest.raises(TypeError, match=message):
+        function(jm.Isometric(), simple_target(), **{given: 1})
+    for other, first in ((jm.fit_cohort, []), (jm.fit_joint, {}), (jm.run_study, "study.csv")):
+        with pytest.raises(TypeError, match="has no option 'sedes'"):
+            other(first, sedes=1)
 
 
 def test_a_task_that_does_not_fluctuate():
@@ -1020,39 +1000,13 @@ def test_monte_carlo_agrees_with_the_linear_fit():
         assert abs(simulated[name].value - linear[name].value) < 0.2 * linear[name].stderr, name
 
 
-@pytest.mark.slow
-def test_weak_increments_change_a_fit_by_its_monte_carlo_error_only(x64):
-    """The nonlinear correction and the check are means over seeds; the path that is shown is
-    not."""
-    gaussian, weak = quick_fit(), quick_fit(increments="weak")
-    known = [
-        name
-        for name, estimate in (gaussian.parameters | gaussian.derived).items()
-        if estimate.stderr
-    ]
-    assert len(known) > 3
-    for name in known:
-        assert abs(weak[name].value - gaussian[name].value) < 0.2 * gaussian[name].stderr, name
-    assert not np.array_equal(weak.fitted, gaussian.fitted)
-    # 16 seeds with a control variate: the ratio of two means of nearly linear spectra.
-    np.testing.assert_allclose(weak.fitted, gaussian.fitted, rtol=0.02)
-    key = jax.random.fold_in(jax.random.key(0), 1)
-    shown = jm.simulate(jm.settled(weak.task), key).output
-    np.testing.assert_array_equal(weak.only.stretch[1], np.asarray(shown)[-501:])
-
-
 def test_controlled_moments_are_those_of_a_controlled_ensemble(x64):
-    """With weak increments, which the paths of a fit take over from its arguments."""
-    options = FitOptions(free=FEW, method="montecarlo", increments="weak", dt=1e-3, key=3)
+    options = FitOptions(free=FEW, method="montecarlo", dt=1e-3, key=3)
     problem = planned(jm.Isometric(), simple_target(), options).problem
     (part,), seeds = problem.montecarlo(16).parts, 16
     assert part.model.control
-    runs = runs_for_means(
-        jm.settled(jm.Isometric()),
-        jax.random.fold_in(problem.key, 0),
-        seeds,
-        Draws(increments="weak"),
-    )
+    key = jax.random.fold_in(problem.key, 0)
+    runs = runs_for_means(jm.settled(jm.Isometric()), key, seeds)
     power = at_once(lambda task: part.model.moments(task).power, as_arrays(jm.Isometric()))
     np.testing.assert_allclose(power, runs.mean_spectrum().power[:30], rtol=1e-9)
 

@@ -14,9 +14,10 @@ from jaxmuscle.fits._half_power import half_power_intervals
 from jaxmuscle.fits._intervals import Interval, intervals
 from jaxmuscle.fits._part import Estimate
 from jaxmuscle.fits._tables import with_intervals
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import consequences, consequences_of_rows, expand
 from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._linearised import linearise
 from jaxmuscle.response._transfer import half_power_frequency, half_power_level

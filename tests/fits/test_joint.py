@@ -17,9 +17,10 @@ import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits._joint import planned_jointly
 from jaxmuscle.model._parameters import DEFAULT_FREE
-from jaxmuscle.objective._arguments import FitOptions, joint_names, task_for
+from jaxmuscle.objective._arguments import joint_names, task_for
 from jaxmuscle.objective._consequences import expand, quantities
 from jaxmuscle.objective._covariance import common_scales, identifiability
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._residuals import Residuals, data_residuals
 from jaxmuscle.objective._starts import distinct, starting_points
 

@@ -1,10 +1,9 @@
-"""A fit as functions for optimisers and samplers of one's own, and a fit with another optimiser."""
+"""A fit as functions for optimisers and samplers of one's own."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 import scipy
 from compiled import at_once, kept_jit
@@ -208,25 +207,6 @@ def test_scipy_finds_the_minimum_of_the_fit(problem, result):
             else min(start.cost for start in result.starts)
         )
         assert found.success and found.cost == pytest.approx(ours, rel=1e-3)
-
-
-def test_another_optimiser_finds_the_same(result):
-    other = jm.fit(TASK, TARGET, **ALONE, optimiser=optx.Dogleg(rtol=1e-9, atol=1e-9))
-    assert (
-        other.success
-        and other.settings["optimiser"] == "Dogleg"
-        and "optimiser" not in result.settings
-    )
-    best, mine = (min(start.cost for start in each.starts) for each in (other, result))
-    assert best == pytest.approx(mine, rel=1e-3)
-
-
-def test_what_is_no_least_squares_solver_is_refused():
-    for wrong in (optx.BFGS(1e-3, 1e-3), "dogleg", optx.LevenbergMarquardt):
-        with pytest.raises(
-            ValueError, match=r"^optimiser: this is .*jaxmuscle\.problem\(task, target\)"
-        ):
-            jm.fit(TASK, TARGET, optimiser=wrong)
 
 
 def test_a_target_without_scatter_has_residuals_but_no_density():

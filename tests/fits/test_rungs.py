@@ -18,10 +18,11 @@ from jaxmuscle.fits._part import Estimate
 from jaxmuscle.fits._peaks import find_slower_peak, find_tremor, find_unseen
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.model._rungs import QUIET, RUNGS
-from jaxmuscle.objective._arguments import DAMPING_SD, FitOptions, planned
+from jaxmuscle.objective._arguments import DAMPING_SD, planned
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._derived import derived_names
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._linearised import linearised
 from jaxmuscle.spectra._bin_law import bin_statistics

@@ -8,7 +8,8 @@ import pytest
 
 import jaxmuscle as jm
 from jaxmuscle.fits._cohort import _alike
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
+from jaxmuscle.objective._options import FitOptions
 
 TREMOR = {"resonance_amplitude": 0.05, "resonance_frequency": 8.0, "resonance_width": 1.0}
 TRUTH = jm.on_rung(jm.PrescribedForce(observe="acceleration"), 2).replace(**TREMOR)

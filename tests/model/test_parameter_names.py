@@ -12,7 +12,8 @@ import pytest
 
 import jaxmuscle as jm
 from jaxmuscle.model import TASKS
-from jaxmuscle.objective._arguments import FitOptions, free_names
+from jaxmuscle.objective._arguments import free_names
+from jaxmuscle.objective._options import FitOptions
 
 TREMOR = jm.on_rung(jm.Isometric(), 2)
 KINDS = list(TASKS.values())

@@ -15,7 +15,7 @@ from scipy.special import digamma, gammaln
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._covariance import residual_covariance
 from jaxmuscle.objective._likelihood import (
     _gamma_level,
@@ -24,6 +24,7 @@ from jaxmuscle.objective._likelihood import (
     log_marginal,
     measured_bins,
 )
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.spectra._bin_law import bin_rows, trial_samples, welch_law

@@ -30,7 +30,8 @@ from jaxmuscle.model import Decay, NoiseSum, RampHold
 from jaxmuscle.response._expected import noise_variance
 from jaxmuscle.response._expected_moments import linear_spectrum
 from jaxmuscle.response._harmonic_line import harmonic_system
-from jaxmuscle.response._linearised import Linearisation, linearised
+from jaxmuscle.response._linear_task import Linearisation
+from jaxmuscle.response._linearised import linearised
 from jaxmuscle.response._second_order import FAINT, negative_coefficients, second_order
 
 BOTH = {"K_w": 0.15, "K_z": 0.05}

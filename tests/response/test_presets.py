@@ -14,7 +14,8 @@ import jaxmuscle as jm
 from jaxmuscle._common.errors import PresetError
 from jaxmuscle.fits._fit_file import FORMAT
 from jaxmuscle.model._task_tables import task_to_table
-from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
+from jaxmuscle.objective._arguments import at_mean, planned
+from jaxmuscle.objective._options import FitOptions
 
 BUNDLED = "zagrodny-slifkin"
 TASKS = {

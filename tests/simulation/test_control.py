@@ -12,7 +12,8 @@ import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.response._expected_moments import linear_spectrum
-from jaxmuscle.response._linearised import LinearTask, linearised
+from jaxmuscle.response._linear_task import LinearTask
+from jaxmuscle.response._linearised import linearised
 from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.simulation._simulate import companion

@@ -22,10 +22,10 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits._joint import planned_jointly
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
-from jaxmuscle.objective._arguments import FitOptions
 from jaxmuscle.objective._consequences import Expansion, expand, quantities
 from jaxmuscle.objective._least_squares import least_squares
 from jaxmuscle.objective._likelihood import Likelihood, without_offsets
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.objective._scoring import maximise
 from jaxmuscle.response._equilibrium import equilibrium
@@ -70,7 +70,6 @@ def fitted(
     )
     table = {
         "free": list(free),
-        "residual": "log",
         "mean_force": None,
         "bounds": {},
         "starts": 1,

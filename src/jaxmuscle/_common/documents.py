@@ -28,7 +28,6 @@ DEEPEST = 32
 KEY = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
 DEEP = re.compile(rf"(?<![\w\\-])(?:{KEY}\.[ \t]*+){{{DEEPEST}}}")
 NESTED = "is nested too deeply to be anything that jaxmuscle writes"
-DISAGREE = 1e-9  # relative; numbers that follow from others may be rounded differently
 
 T = TypeVar("T")
 
@@ -80,7 +79,7 @@ def checked(
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as wrong:
-        raise error(f"{file}: {_in_words(_located(table, kind, str(wrong)))}") from None
+        raise error(f"{file}: {_in_words(str(wrong))}") from None
     except RecursionError:
         raise error(f"{file}: {NESTED}") from None
 
@@ -95,40 +94,6 @@ def converted(value: Any, kind: Any, where: str, error: type[ValueError] = Value
         raise error(
             f"{where} = {_shown(value)}: {_in_words(str(wrong)).removeprefix('the table ')}"
         ) from None
-
-
-def contradiction(stated: Any, meant: Any, place: str = "", *, whole: bool = True) -> str | None:
-    """Where a table says something else than what follows from its other entries, in words; None if
-    nowhere.
-
-    Without `whole` it may leave something out: what an earlier version did not write.
-    """
-    if isinstance(stated, dict) and isinstance(meant, dict):
-        missing = [key for key in meant if key not in stated]
-        if whole and missing:
-            return f"{place or 'the table'} has no key {missing[0]!r}"
-        pairs = [(key, value, meant.get(key)) for key, value in stated.items()]
-    elif isinstance(stated, list) and isinstance(meant, list | tuple) and len(stated) == len(meant):
-        pairs = [(f"[{i}]", *pair) for i, pair in enumerate(zip(stated, meant, strict=True))]
-    else:
-        return (
-            None
-            if _same(stated, meant)
-            else f"{place} is {_shown(stated)}, but the rest of the file means {_shown(meant)}"
-        )
-    found = (
-        contradiction(one, other, f"{place}.{key}".lstrip(".").replace(".[", "["), whole=whole)
-        for key, one, other in pairs
-    )
-    return next(filter(None, found), None)
-
-
-def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, bool | str | None) or isinstance(b, bool | str | None):
-        return type(a) is type(b) and a == b
-    if isinstance(a, float | int) and isinstance(b, float | int):
-        return math.isclose(a, b, rel_tol=DISAGREE)
-    return a == b
 
 
 def _shown(value: Any) -> str:
@@ -176,47 +141,6 @@ def _impossible(value: Any) -> str | None:
     if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
         return "holds half a character (a lone surrogate)"
     return None
-
-
-def _located(table: dict[str, Any], kind: Any, message: str) -> str:
-    """The message with the keys that msgspec leaves out where keys are free: the entry that alone
-    is refused."""
-    while "[...]" in message:
-        way = message.rpartition("`$")[2].partition("[...]")[0]
-        steps = [
-            int(index) if index else name
-            for name, index in re.findall(r"\.([^.\[\]`]+)|\[(\d+)\]", way)
-        ]
-        holder: Any = table
-        for step in steps:
-            holder = holder[step]
-        entries = holder.items()
-        wrong = next(
-            (key for key, entry in entries if _is_refused(_with(table, steps, {key: entry}), kind)),
-            None,
-        )
-        if wrong is None:
-            break
-        message = message.replace("[...]", f".{wrong}", 1)
-    return message
-
-
-def _with(table: Any, steps: list[Any], value: Any) -> Any:
-    """A copy of nested tables with another entry at the end of the way."""
-    if not steps:
-        return value
-    step, *rest = steps
-    if isinstance(table, dict):
-        return table | {step: _with(table[step], rest, value)}
-    return [_with(entry, rest, value) if i == step else entry for i, entry in enumerate(table)]
-
-
-def _is_refused(table: Any, kind: Any) -> bool:
-    try:
-        msgspec.convert(table, kind)
-    except msgspec.ValidationError:
-        return True
-    return False
 
 
 def _in_words(message: str) -> str:

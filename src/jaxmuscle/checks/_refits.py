@@ -85,7 +85,7 @@ def refitted(problem: FitProblem, theta: Float[np.ndarray, " free"], drawn: Draw
     objective, count = problem.linear(), len(drawn.power[0])
     starts = _starts(problem, theta, drawn)
     each = starts.shape[1]
-    data = _data(problem, objective, drawn, tuple(np.zeros_like(power) for power in drawn.power))
+    data = _data(problem, drawn, tuple(np.zeros_like(power) for power in drawn.power))
     first = least_squares(
         objective,
         problem.coordinates.from_theta(starts.reshape(count * each, -1)),
@@ -95,7 +95,7 @@ def refitted(problem: FitProblem, theta: Float[np.ndarray, " free"], drawn: Draw
     cost = np.where(np.isfinite(first.cost), first.cost, np.inf).reshape(count, each)
     s = first.s.reshape(count, each, -1)[np.arange(count), np.argmin(cost, axis=1)]
     share = _seen(objective, s)[1]
-    second = least_squares(objective, s, 40, data=_data(problem, objective, drawn, share))
+    second = least_squares(objective, s, 40, data=_data(problem, drawn, share))
     return Refits(np.asarray(objective.theta(second.s)), second.cost, *_seen(objective, second.s))
 
 
@@ -130,19 +130,15 @@ def _starts(
     return np.stack(starts, axis=1)
 
 
-def _data(
-    problem: FitProblem, objective: Residuals, drawn: Drawn, share: tuple[Rows, ...]
-) -> tuple[Data, ...]:
+def _data(problem: FitProblem, drawn: Drawn, share: tuple[Rows, ...]) -> tuple[Data, ...]:
     made = []
-    for i, (part, own) in enumerate(zip(problem.parts, objective.data, strict=True)):
+    for i, part in enumerate(problem.parts):
         law = bin_statistics(part.target, share[i])
-        sigma = np.broadcast_to(np.asarray(own.sigma), (len(drawn.power[i]), *np.shape(own.sigma)))
         made.append(
             Data(
                 drawn.power[i],
                 law.bias,
                 law.sd,
-                sigma,
                 drawn.variation[i],
                 drawn.mean[i],
                 drawn.stiffness[i],

@@ -34,7 +34,6 @@ from .options import (
     Formats,
     Free,
     Holds,
-    Increments,
     Json,
     MethodName,
     Mvc,
@@ -42,7 +41,6 @@ from .options import (
     NoiseName,
     Output,
     Quantity,
-    ResidualName,
     Seed,
     Segments,
     TargetTask,
@@ -116,15 +114,6 @@ def fit(
             ),
         ),
     ] = None,
-    residual: Annotated[
-        ResidualName,
-        typer.Option(
-            help=(
-                "What is compared: log, the logarithm of the powers; linear, the powers;"
-                " cumulative, their running sums."
-            )
-        ),
-    ] = ResidualName.log,
     free: Free = None,
     fix: Fix = None,
     starts: Annotated[
@@ -147,17 +136,6 @@ def fit(
                 " the task has no linear "
                 "response."
             ),
-        ),
-    ] = None,
-    increments: Annotated[
-        Increments | None,
-        typer.Option(
-            help=(
-                "Random numbers of simulations: gaussian, or weak (cheaper and faster, good for"
-                " means and spectra, not for "
-                "single traces)."
-            ),
-            show_default="gaussian",
         ),
     ] = None,
     seed: Seed = 0,
@@ -261,7 +239,6 @@ def fit(
             "fix": fixed_values(fix),
             "free": names_in(free),
             "noise": None if noise is None else str(noise),
-            "residual": str(residual),
             "starts": starts,
             "key": seed,
         }
@@ -281,10 +258,10 @@ def fit(
             unused(reading, "axis", "quantity", window=window, what="recordings; these are spectra")
             if everything:
                 raise ValueError("--all: of several spectra all numbers are in cohort.csv")
-            if method != MethodName.linear or seeds is not None or increments is not None or quick:
+            if method != MethodName.linear or seeds is not None or quick:
                 raise ValueError(
-                    "several spectra are fitted in one go, without simulation: leave out "
-                    "--method, --seeds, --increments and --quick, or fit them one at a time"
+                    "several spectra are fitted in one go, without simulation: leave out --method,"
+                    " --seeds and --quick, or fit them one at a time"
                 )
             options |= {"rung": rungs or 0}
             raise typer.Exit(
@@ -301,7 +278,6 @@ def fit(
                 "--segments and --dataset belong to spectra, and these are recordings: leave"
                 " them out"
             )
-        options |= {} if increments is None else {"increments": str(increments)}
         if hold:
             _check_hold(method, options["fix"], task, quantity)
             most = 0 if rung is not None or noise is not None or options["free"] else RUNGS

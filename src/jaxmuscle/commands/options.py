@@ -25,12 +25,6 @@ class Increments(StrEnum):
     weak = "weak"
 
 
-class ResidualName(StrEnum):
-    log = "log"
-    linear = "linear"
-    cumulative = "cumulative"
-
-
 class SpectrumName(StrEnum):
     standard = "standard"
     slow = "slow"

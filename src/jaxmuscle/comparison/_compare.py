@@ -24,9 +24,10 @@ from jaxmuscle.model._parameters import (
 )
 from jaxmuscle.model._rungs import RICHER, on_rung
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._coordinates import task_at
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised
 

@@ -16,7 +16,8 @@ from jaxmuscle._common.text import listed
 from jaxmuscle._common.types import Key, Seeds
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._task import AbstractTask, require_task
-from jaxmuscle.response._linearised import LinearTask
+from jaxmuscle.response._linear_task import LinearTask
+from jaxmuscle.response._linearised import linearise
 from jaxmuscle.simulation._simulate import DT, DURATION, require_finite, trajectories
 from jaxmuscle.simulation._trajectory import Trajectory
 
@@ -205,7 +206,7 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
                 "under a JAX transformation an ensemble can be of one task, in memory: no sweep,"
                 " reduce or store"
             )
-        linear = LinearTask.of(as_arrays(task)) if control else None
+        linear = LinearTask.of(as_arrays(task), linearise(task)) if control else None
         return trajectories(task, linear, key, jnp.asarray(np.asarray(numbers)), plan, draws=draws)
     linear = companions(task, duration, control)
     kept = levels is not None or store is not None
@@ -245,9 +246,8 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
         return _in_memory(layout, tell)
 
 
-def runs_for_means(task: AbstractTask, key: Key, seeds: int, draws: Draws) -> Trajectory:
-    """Seeds 0 to seeds - 1 as `ensemble` simulates them, with weak numbers, too: for means over the
-    seeds alone.
+def runs_for_means(task: AbstractTask, key: Key, seeds: int) -> Trajectory:
+    """Seeds 0 to seeds - 1 as `ensemble` simulates them.
 
     `AT_ONCE` of them at once: one program for any number, and each core of a CPU has some.
     """
@@ -263,7 +263,7 @@ def runs_for_means(task: AbstractTask, key: Key, seeds: int, draws: Draws) -> Tr
         cut=cut,
         states=True,
         spectrum=False,
-        draws=draws,
+        draws=Draws(),
         threads=None,
     )
     found = _in_memory(layout, lambda pace: None)

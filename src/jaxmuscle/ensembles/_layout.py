@@ -20,7 +20,7 @@ from jaxtyping import Int, PRNGKeyArray
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.response._linearised import LinearTask
+from jaxmuscle.response._linear_task import LinearTask
 from jaxmuscle.simulation._batch import (
     LANES,
     THREADED,

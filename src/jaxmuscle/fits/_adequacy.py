@@ -4,7 +4,6 @@ and where it fails."""
 import dataclasses
 import functools
 import itertools
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -23,12 +22,12 @@ from jaxmuscle.objective._residuals import PartResiduals, Residuals, further_res
 from jaxmuscle.response._expected import Moments
 
 from ._checks import Stage, seen_best
+from ._fit_file import ADEQUATE, Adequacy
 from ._half_power import HALF_POWER, half_power_intervals
 from ._intervals import Interval, intervals
 from ._refit import STRENGTHS, Refit, refit_of
 from ._signal_checks import SignalTest, check_signals
 
-ADEQUATE = 0.01
 ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
 REPLICATES = 999
 SAMPLES = 5  # of the key, for what is simulated beside the samples
@@ -37,30 +36,6 @@ ELSEWHERE = (
     " compare (a dynamic stiffness with jaxmuscle fit stiffness.csv)"
 )
 Rows = Float[np.ndarray, "replicates residuals"]
-
-
-class Adequacy(NamedTuple):
-    """`chi2` of all data residuals of a fit, what is `expected` of it under the fitted model, and
-    its p-value `p`.
-
-    `misfit` says in words where the data lie furthest from the model, if it does not describe them.
-    """
-
-    chi2: float
-    expected: float
-    p: float
-    misfit: str
-
-    @property
-    def adequate(self) -> bool:
-        """Whether the model describes the data: p >= 0.01."""
-        return self.p >= ADEQUATE
-
-    @property
-    def widening(self) -> float:
-        """By how much standard errors grow where the model does not describe the data, `√(chi² /
-        expected)`."""
-        return 1.0 if self.adequate else max(1.0, float(np.sqrt(self.chi2 / self.expected)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -298,7 +273,7 @@ def _drawn(objective: Residuals, scatter: np.ndarray, generator: np.random.Gener
     start = 0
     for part in objective.parts:
         bins = len(part.statistics.sd)
-        if part.residual == "log" and objective.linear and bins:
+        if objective.linear and bins:
             drawn[:, start : start + bins] = drawn_log_residuals(part, generator, REPLICATES)
         start += _rows_of(part)
     return drawn
@@ -311,8 +286,7 @@ def rows_of(ended: Endpoint) -> list[slice]:
 
 
 def _rows_of(part: PartResiduals) -> int:
-    bins = len(part.statistics.sd) - (part.residual == "cumulative")
-    return bins + part.data.further
+    return len(part.statistics.sd) + part.data.further
 
 
 def _misfit(
@@ -323,8 +297,6 @@ def _misfit(
 
     No bin in it is off by more than one standard deviation the other way.
     """
-    if problem.residual == "cumulative":
-        return ""
     whose = {
         part.name: f"{part.name} has" if len(problem.parts) > 1 else "the data have"
         for part in problem.parts

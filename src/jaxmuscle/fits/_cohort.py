@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import equinox as eqx
 import numpy as np
@@ -14,14 +14,13 @@ from jaxmuscle._common.cards import Card, Result, reports
 from jaxmuscle._common.environment import fitting, versions
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.tables import frame
-from jaxmuscle._common.types import Key
 from jaxmuscle.data._measure import Measure
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
-from jaxmuscle.objective._arguments import FitOptions, Plan, at_mean, planned, task_for
+from jaxmuscle.objective._arguments import Plan, at_mean, planned, task_for
+from jaxmuscle.objective._options import FitOptions, SearchOptions
 from jaxmuscle.spectra._bin_law import trial_samples
 from jaxmuscle.spectra._fluctuations import BANDS
 
@@ -242,23 +241,14 @@ def comparable(result: FitResult) -> dict[str, Any]:
     return known | of_model
 
 
-def fit_cohort(  # noqa: PLR0913 (options of a public call)
+def fit_cohort(
     targets: Iterable[Any],
     *,
     groups: Mapping[str, str] | None = None,
     task: type[AbstractTask] | None = None,
-    noise: str | AbstractNoise | None = None,
-    fix: Mapping[str, float] | None = None,
-    starts: int = 32,
-    free: Iterable[str] | None = None,
-    residual: str = "log",
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    priors: Mapping[str, float | None] | None = None,
-    coefficient_of_variation: bool = True,
-    max_steps: int = 40,
-    key: Key = 0,
     rung: int = 0,
     progress: bool | Callable[[str, float], None] = False,
+    **options: Unpack[SearchOptions],
 ) -> CohortResult:
     """Fit many targets, in linear response, all starts of all of them in one batch.
 
@@ -276,9 +266,9 @@ def fit_cohort(  # noqa: PLR0913 (options of a public call)
     - `targets`: one of each person, in any form that `fit` takes (a list is the trials of one)
     - `groups` {target name: group}
     - `task`: the same kind for all (by default what each measured)
-    - `noise`, `fix`, `free`, `residual`, `bounds`, `priors`, `key`, `max_steps`,
-      `coefficient_of_variation`: as in `fit`
-    - `starts` for each target
+    - `free`, `fix`, `noise`, `bounds`, `priors`, `coefficient_of_variation`, `max_steps`, `key`: as
+      in `fit`
+    - `starts` for each target (32)
     - `rung`: the model of all of them (`on_rung`: 0 the base model, 1 with activation, 2 with
       resonance, 3 with a second one), so that their numbers can be compared
     - `progress`: True or a function of (text, share)
@@ -288,6 +278,7 @@ def fit_cohort(  # noqa: PLR0913 (options of a public call)
 
     **Raises:** `ValueError` for no targets, equal names and a group of an unknown target.
     """
+    asked = FitOptions.of(fit_cohort, SearchOptions, {"starts": 32, **options})
     loaded, failed = _loaded(targets, on_rung(PrescribedLength(), rung) if rung else None)
     unknown = set(groups or {}) - set(loaded) - set(failed)
     if unknown:
@@ -295,24 +286,13 @@ def fit_cohort(  # noqa: PLR0913 (options of a public call)
             f"groups: no target is called {', '.join(sorted(unknown))}; there are"
             f" {', '.join(loaded)}"
         )
-    options = FitOptions(
-        free=free,
-        fix=fix,
-        residual=residual,
-        starts=starts,
-        key=key,
-        bounds=bounds,
-        priors=priors,
-        coefficient_of_variation=coefficient_of_variation,
-        max_steps=max_steps,
-    )
     results: dict[str, FitResult] = {}
     with told(progress, f"fitting {len(loaded)} targets") as tell, fitting():
         batches: dict[Any, dict[str, Plan]] = {}
         for name, target in loaded.items():
-            model = with_noise(task_for(target, task), noise, fix)
+            model = with_noise(task_for(target, task), asked.noise, asked.fix)
             try:
-                model, given = at_mean(on_rung(model, rung) if rung else model, target, options)
+                model, given = at_mean(on_rung(model, rung) if rung else model, target, asked)
                 plan = planned(model, target, options_for(model, given))
             except ValueError as error:
                 failed[name] = str(error)

@@ -1,21 +1,20 @@
 """Fit of a task's parameters to a target spectrum, in linear response or by Monte Carlo."""
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Any, Literal, Unpack
 
 from jaxmuscle._common.arrays import all_concrete, require
 from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.progress import told
-from jaxmuscle._common.types import Key
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._perturbed import PerturbedRecording
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._rungs import QUIET, RUNGS, is_base, on_rung
 from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.model._white_noise import BandLimitedNoise
-from jaxmuscle.objective._arguments import DT, FitOptions, Plan, at_mean, planned
+from jaxmuscle.objective._arguments import Plan, at_mean, planned
+from jaxmuscle.objective._options import DT, FitOptions, SimulationOptions
 
 from ._ladder import Models, first_rung, options_for
 from ._perturbed import ANEW, alike, analysed, recordings_of, seen_with, without_rhythm
@@ -23,30 +22,16 @@ from ._result import FitResult
 from ._search import search
 
 
-def fit(  # noqa: PLR0913 (options of a public call)
+def fit(
     task: AbstractTask,
     target: Any,
     *,
-    free: Iterable[str] | None = None,
-    fix: Mapping[str, float] | None = None,
-    noise: str | AbstractNoise | None = None,
     method: str = "linear",
-    residual: str = "log",
-    starts: int | None = None,
-    seeds: int | None = None,
-    key: Key = 0,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    priors: Mapping[str, float | None] | None = None,
-    coefficient_of_variation: bool = True,
     mean_force: tuple[float, float] | Literal[False] | None = None,
-    max_steps: int = 40,
     dt: float = DT,
-    check_seeds: int | None = None,
-    rungs: int | None = None,
     progress: bool | Callable[[str, float], None] = False,
-    optimiser: Any = None,
-    increments: str = "gaussian",
     answer: Callable[[FitResult], None] | None = None,
+    **options: Unpack[SimulationOptions],
 ) -> FitResult:
     """Find the parameters whose expected spectrum is the target's: Levenberg-Marquardt from many
     starts.
@@ -55,9 +40,9 @@ def fit(  # noqa: PLR0913 (options of a public call)
         result = jm.fit(jm.task_for(target), target)
         print(result)
 
-    Minimises `½ Σ r_k² + ½ Σ θ_j²`, r the residuals in standard deviations of the target (log
-    residual: `(z_k - z̄) / sd_k`, `z_k = ln(target_k / fitted_k) - bias_k`), θ the free parameters'
-    distance from the task's own values in standard deviations of the prior.
+    Minimises `½ Σ r_k² + ½ Σ θ_j²`, r the residuals in standard deviations of the target, `(z_k -
+    z̄) / sd_k` with `z_k = ln(target_k / fitted_k) - bias_k`, θ the free parameters' distance from
+    the task's own values in standard deviations of the prior.
 
     `method="linear"`: the model's spectrum is that of the linear response (`expected_spectrum`);
     the best minimum is then polished with the nonlinear model's correction to it, from `seeds`
@@ -79,7 +64,6 @@ def fit(  # noqa: PLR0913 (options of a public call)
       only k_w, k_z, c_w, c_z, m_w and m_z
     - `fix`: values to set, which are then not free
     - `noise`: a name or an object
-    - `residual`: "log", "linear" or "cumulative"
     - `starts`: from how many points the search starts (100, or 8 for a task without linear
       response)
     - `seeds`: noise paths of the nonlinear correction (32, or 48 for a task without linear
@@ -100,11 +84,6 @@ def fit(  # noqa: PLR0913 (options of a public call)
     - `progress`: True or a function of (text, share)
     - `rungs`: how many richer models may be tried where the spectrum shows a tremor, or the base
       model does not describe the data (`on_rung`; 3, or 0 where `noise` or `free` is given)
-    - `optimiser`: what makes the steps instead of `optimistix.LevenbergMarquardt`: another of
-      optimistix's Gauss-Newton solvers, `optimistix.Dogleg(1e-9, 1e-9)` say (for others there is
-      `problem`)
-    - `increments`: "weak" for the faster random numbers of `ensemble` in all that is simulated
-      here, of which only means over the seeds are taken
     - `answer`: a function that gets the result as soon as the search ends: with the verdict, before
       the simulated check, and before profile and p-value of the harmonic
 
@@ -123,32 +102,14 @@ def fit(  # noqa: PLR0913 (options of a public call)
     recordings = recordings_of(target, task)
     aim = recordings[0].name if recordings else (target := as_target(target)).name
     with told(progress, f"fitting {aim}") as tell, fitting():
-        options = FitOptions(
-            free=free,
-            fix=fix,
-            method=method,
-            residual=residual,
-            starts=starts,
-            seeds=seeds,
-            check_seeds=check_seeds,
-            key=key,
-            bounds=bounds,
-            priors=priors,
-            coefficient_of_variation=coefficient_of_variation,
-            mean_force=mean_force,
-            max_steps=max_steps,
-            dt=dt,
-            progress=tell,
-            rungs=rungs,
-            optimiser=optimiser,
-            increments=increments,
-        )
-        task = with_noise(task, noise, fix)
+        own = {"method": method, "mean_force": mean_force, "dt": dt, "progress": tell}
+        given = FitOptions.of(fit, SimulationOptions, options, **own)
+        task = with_noise(task, given.noise, given.fix)
         if recordings:
             tell("subtracting the response to the movement", 0.01)
-            target = analysed(recordings, without_rhythm(task, options), options)
-        top = _top(task, target, options, chosen=noise is not None)
-        models = _models(task, target, options, top, recordings)
+            target = analysed(recordings, without_rhythm(task, given), given)
+        top = _top(task, target, given)
+        models = _models(task, target, given, top, recordings)
         plan = models.plan_at(models.first)
         return search(plan, answer, models if top > models.lowest else None)
 
@@ -183,23 +144,22 @@ def _models(
     return Models(first, lowest, top, plan_at, renewed if recordings else None)
 
 
-def _top(task: AbstractTask, target: Target, options: FitOptions, *, chosen: bool) -> int:
+def _top(task: AbstractTask, target: Target, options: FitOptions) -> int:
     """The highest rung of the ladder that may be tried: all of them, unless a model was asked
     for."""
     possible = (
         options.method == "linear"
-        and options.residual == "log"
         and is_base(task)
         and (target.segments is not None or target.sigma is not None)
     )
     if options.rungs is None:
-        asked = chosen or options.free is not None or type(task.noise) is not BandLimitedNoise
-        return len(RUNGS) - 1 if possible and not asked else 0
+        chosen = options.noise is not None or type(task.noise) is not BandLimitedNoise
+        return len(RUNGS) - 1 if possible and not chosen and options.free is None else 0
     if options.rungs >= len(RUNGS):
         raise ValueError(f"rungs = {options.rungs}: the highest is {len(RUNGS) - 1}")
     if options.rungs and not possible:
         raise ValueError(
-            "rungs: richer models can be tried only if the method is 'linear', the residual 'log',"
-            " the target states segments or sigma, and the task has no activation or resonance yet"
+            "rungs: richer models can be tried only if the method is 'linear', the target"
+            " states segments or sigma, and the task has no activation or resonance yet"
         )
     return options.rungs

@@ -1,5 +1,6 @@
 """What `fit.json` holds: the schema of its keys."""
 
+import math
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -7,11 +8,11 @@ from msgspec import Meta
 
 from jaxmuscle._common.documents import Table, says
 from jaxmuscle._common.keys import SEEDS
-from jaxmuscle.data._target import Target
-from jaxmuscle.objective._arguments import METHODS, RESIDUALS
+from jaxmuscle.objective._options import METHODS
 from jaxmuscle.objective._starts import SPREAD
 
 FORMAT = 5
+ADEQUATE = 0.01  # p of the verdict from which on a model describes the data
 
 Number = float | None  # null where it is not finite
 Numbers = list[Number]
@@ -37,7 +38,7 @@ class EstimateTable(Table, kw_only=True):
     ]
 
 
-class AdequacyTable(Table, kw_only=True):
+class Adequacy(Table):
     """Whether the model describes the data: `adequacy`."""
 
     chi2: Annotated[
@@ -52,8 +53,19 @@ class AdequacyTable(Table, kw_only=True):
         ),
     ]
 
+    @property
+    def adequate(self) -> bool:
+        """Whether the model describes the data: p >= 0.01."""
+        return self.p >= ADEQUATE
 
-class RungTable(Table, kw_only=True):
+    @property
+    def widening(self) -> float:
+        """By how much standard errors grow where the model does not describe the data, `√(chi² /
+        expected)`."""
+        return 1.0 if self.adequate else max(1.0, math.sqrt(self.chi2 / self.expected))
+
+
+class Rung(Table):
     """A model that was tried: an entry of `ladder`."""
 
     number: Annotated[
@@ -72,7 +84,7 @@ class RungTable(Table, kw_only=True):
     chosen: Annotated[bool, says("Whether this model was chosen")]
 
 
-class StartTable(Table, kw_only=True):
+class Start(Table):
     """A start of the search: an entry of `starts`."""
 
     cost: Annotated[
@@ -119,7 +131,6 @@ class SettingsTable(Table, kw_only=True):
     fit."""
 
     free: Annotated[list[str], says("Names of the fitted parameters")]
-    residual: Annotated[Literal[RESIDUALS], says("How powers were compared, see docs/fitting.md")]  # pyright: ignore[reportInvalidTypeForm]
     prior_centre: Annotated[
         dict[str, float], says("Centre of the prior of every free parameter, in its unit")
     ]
@@ -140,13 +151,6 @@ class SettingsTable(Table, kw_only=True):
         Count, says("Largest number of steps that one search from a starting point may take")
     ]
     dt: Annotated[Annotated[float, Meta(gt=0)], says("Step of the noise [s]")]
-    increments: Annotated[
-        Literal["gaussian", "weak"],
-        says(
-            "Random numbers of the simulations: normal ones, or the cheaper ones of docs/engine.md",
-            missing="`gaussian`",
-        ),
-    ] = "gaussian"
     coefficient_of_variation: Annotated[
         bool | dict[str, bool], says("Whether it was data; of several targets by name")
     ]
@@ -171,9 +175,6 @@ class SettingsTable(Table, kw_only=True):
     ]
     spectrum: Annotated[dict[str, Any], says("Spectrum settings; of several targets by name")]
     steps_per_sample: Annotated[Count, says("Steps of dt between samples")]
-    optimiser: Annotated[
-        str | None, says("Solver; null for Levenberg-Marquardt", missing="Levenberg-Marquardt")
-    ] = None
     separate: Annotated[
         tuple[str, ...],
         says("Parameters with a value for each target", missing="fit of one target"),
@@ -271,7 +272,7 @@ class FitTable(Table, kw_only=True):
         bool | None, says("Whether the model describes the data, null where that is unknown")
     ]
     adequacy_p: Annotated[Share | None, says("p-value of that verdict")]
-    adequacy: Annotated[AdequacyTable | None, says("Numbers behind that verdict")]
+    adequacy: Annotated[Adequacy | None, says("Numbers behind that verdict")]
     verdict: Annotated[str, says("Verdict in words")]
     method: Annotated[Literal[METHODS], says("How it was fitted")]  # pyright: ignore[reportInvalidTypeForm]
     parameters: Annotated[
@@ -283,42 +284,22 @@ class FitTable(Table, kw_only=True):
     ]
     correlation: Annotated[CorrelationTable, says("Correlations of the free parameters")]
     undetermined: Annotated[
-        list[str], says("Sentences: which parameters can change together while the spectrum stays")
+        tuple[str, ...],
+        says("Sentences: which parameters can change together while the spectrum stays"),
     ]
-    ladder: Annotated[list[RungTable], says("Models that were tried")]
+    ladder: Annotated[tuple[Rung, ...], says("Models that were tried")]
     singular_values: Annotated[
         Numbers, says("Singular values of the Jacobian, a number for each direction")
     ]
-    starts: Annotated[list[StartTable], says("Where each start of the search ended")]
+    starts: Annotated[tuple[Start, ...], says("Where each start of the search ended")]
     profile: Annotated[ProfileTable | None, says("Profile of the frequency of the harmonic")]
     harmonic_p_value: Annotated[
         Share | None, says("p-value of the harmonic: how often chance makes one as strong")
     ]
-    notices: Annotated[list[str], says("Notes on the fit")]
+    notices: Annotated[tuple[str, ...], says("Notes on the fit")]
     seed: Annotated[
         Annotated[int, Meta(ge=0, lt=SEEDS)] | None,
         says("The random key (`key=`, `--seed`), if it was a whole number; else null"),
     ]
     settings: Annotated[SettingsTable, says("How it was fitted")]
     versions: Annotated[dict[str, str], says("Versions of the libraries")]
-
-
-def check_lengths(table: PartTable, target: Target) -> None:
-    """Raise a `ValueError` for columns that have not a number for each bin, or for each time."""
-    spectrum, bins = table.spectrum, len(target.bins)
-    columns = {
-        name: getattr(spectrum, name)
-        for name in ("fitted", "harmonic_share", "residual", "deviation")
-    }
-    for name, column in (columns | spectrum.components).items():
-        if column is not None and len(column) != bins:
-            raise ValueError(f"spectrum.{name} has {len(column)} numbers, the target {bins} bins")
-    if len(table.stretch.time) != len(table.stretch.output):
-        raise ValueError("stretch.output needs a number for each of stretch.time")
-    known = 0 if target.stiffness is None else len(target.stiffness.known.frequency)
-    real, imaginary = table.stiffness or ([], [])
-    if not len(real) == len(imaginary) == known:
-        raise ValueError(
-            f"stiffness has {len(real)} real and {len(imaginary)} imaginary parts, the target"
-            f" {known}"
-        )

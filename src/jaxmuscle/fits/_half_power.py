@@ -42,11 +42,11 @@ def half_power_intervals(
     this quantity are widened (`widening`, of every name). Open at both ends, which means not
     determined, if it leaves the compared bins and points: no data are there.
 
-    Of fits in linear response with log residuals only (empty otherwise).
+    Of fits in linear response only (empty otherwise).
 
     **Source:** the inversion of a test is Fieller's (1954, doi:10.1111/j.2517-6161.1954.tb00159.x).
     """
-    if not objective.linear or problem.residual != "log":
+    if not objective.linear:
         return {}
     # a row that runs away belongs to no interval
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):

@@ -48,12 +48,7 @@ def harmonic_test(
     objective = problem.linear()
     problem.tell("trying other frequencies of the harmonic", 0.9)
     frequency, rise = _profile(problem, objective, final)
-    if (
-        not judged
-        or "harmonic_amplitude" not in names
-        or problem.residual != "log"
-        or not objective.parts[0].statistics.known
-    ):
+    if not judged or "harmonic_amplitude" not in names or not objective.parts[0].statistics.known:
         return HarmonicTest(frequency, rise, None)
     problem.tell("simulating spectra without a harmonic", 0.95)
     return HarmonicTest(frequency, rise, p_value(problem, objective, final))
@@ -97,14 +92,10 @@ def p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
 
 
 def p_of_line_left_out(ended: Endpoint) -> float:
-    """The same for a fit of a model without harmonic, of one target; 1 where that has no spectrum
-    in logarithms."""
+    """The same for a fit of a model without harmonic, of one target; 1 without a
+    spectrum."""
     (part,) = ended.problem.parts
-    if (
-        ended.problem.residual != "log"
-        or not len(part.target.bins)
-        or not ended.objective.parts[0].statistics.known
-    ):
+    if not len(part.target.bins) or not ended.objective.parts[0].statistics.known:
         return 1.0
     return _p_of_line(ended, np.arange(len(ended.problem.coordinates.names)))
 

@@ -12,16 +12,21 @@ from jaxmuscle.objective._consequences import Expansion, consequences_of_rows, e
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
 
-REACH = 1.96
+REACH = 1.96  # standard errors to an end of a 95 % interval; 3.84 is its square
 TURNS = 50  # at most, of steps and of moves to the next stage
-# of the way that the curvature says; how much further or nearer a row aims next
+# First stage, as a share of the way that the curvature says: so near the ridge is almost straight.
+# A later stage is at most so many times longer or shorter, since the rise of one stage says little
+# about a place far from it.
 FIRST, FASTER, SLOWER = 0.4, 2.5, 0.4
-GAIN = 0.01  # of the rise: what a turn gains less, it need not go on for
-NEAR = 0.05  # of the rise at the end
-HELD = 0.1  # of the standard deviation
+# A turn that gains less of the rise ends a stage. The last stage is that in which the root of the
+# rise is within `NEAR` of what is sought: over what is left it is extrapolated as a straight line.
+GAIN, NEAR = 0.01, 0.05
+# How tightly a quantity is held at its aim, in its standard deviations: tight enough that it stays
+# there, loose enough that a Gauss-Newton step can follow a ridge that bends.
+HELD = 0.1
 FURTHEST = 4.0  # times as far as the curvature says: beyond, an end is open
-MOST = 8.0  # prior standard deviations
-MOST_ROWS = 32  # of one batch
+MOST = 8.0  # prior standard deviations, beyond which no end is looked for
+MOST_ROWS = 32  # of one batch, which is compiled once
 
 
 class Interval(NamedTuple):
@@ -60,9 +65,9 @@ def intervals(
     errors of this quantity are widened (`widening`, of every name). Positive quantities move in
     their logarithm. All at once.
 
-    Of fits in linear response with log residuals only (empty otherwise).
+    Of fits in linear response only (empty otherwise).
     """
-    if not objective.linear or problem.residual != "log":
+    if not objective.linear:
         return {}
     found: dict[str, Interval] = {}
     # a row that runs away is an open end
@@ -83,6 +88,7 @@ def _some(
     names = list(widening)
     here = Point.of(problem, objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
     curvature = here.jacobian[0].T @ here.jacobian[0] + problem.precision
+    # Directions that neither data nor prior determine have no curvature: they are left alone.
     gain = np.linalg.pinv(curvature, hermitian=True)
     seen_here = [here.quantity(name) for name in names]
     value, slope = (np.repeat([pair[k][0] for pair in seen_here], 2, axis=0) for k in (0, 1))
@@ -93,7 +99,9 @@ def _some(
     stated = np.repeat(list(widening.values()), 2) * np.sqrt(
         np.einsum("ri,ij,rj->r", slope, covariance, slope)
     )
-    wanted = REACH * stated / np.sqrt(ours)  # root of the rise that is sought
+    # Root of the rise that is sought. The cost takes the bins as independent, so its curvature
+    # states the error √ours; the true one, √(gᵀ C g), counts their correlation.
+    wanted = REACH * stated / np.sqrt(ours)
     side = np.tile([-1.0, 1.0], len(names))
     way = np.full(len(start), FIRST)  # that each row is to go, of what the curvature says
     tight = HELD * np.sqrt(ours)
@@ -112,6 +120,7 @@ def _some(
         gain_of_all = best.merit(aim, tight) - tried.merit(aim, tight)
         better = moving | (gain_of_all > 0)
         best = best.where(better, tried)
+        # A success trusts the quadratic model more; one failure undoes more than one success.
         damping = np.where(moving, 1e-2, np.where(better, 0.2 * damping, 10 * damping))
         rise = best.rise(here)
         settled = ~moving & (np.abs(gain_of_all) < GAIN * np.maximum(rise, NEAR * wanted) ** 2)
@@ -123,11 +132,15 @@ def _some(
         moving = settled & ~done  # to the next stage
         stretch = np.where(moving, np.clip(wanted / np.maximum(rise, 1e-6), SLOWER, FASTER), 1.0)
         stretch = np.minimum(stretch, FURTHEST / way)
+        # Further out on the line from the fit through where the row stands: the ridge is bent, and
+        # the line of the curvature would leave it.
         way = way * stretch
         aim = start + side * way * REACH * stated
         further = here.theta[0] + (best.theta - here.theta[0]) * stretch[:, None]
     moved, rise = side * (best.at - start), best.rise(here)
+    # What is left of the way is short: the root of the rise grows along it as the quantity does.
     end = moved * wanted / rise
+    # A row that rose by less than half came to where the cost no longer rises: an open end.
     good = np.isfinite(end) & (moved > 0) & (rise > 0.5 * wanted)
     ends = [float(s * e) if fine else None for s, e, fine in zip(side, end, good, strict=True)]
     return {
@@ -216,11 +229,13 @@ def held_step(
         + seen.theta @ prior
         + pull[:, None] * rise
     )
+    # Marquardt's scaling: damping means the same in every coordinate, whatever its curvature.
     size = np.maximum(np.diagonal(curvature, axis1=1, axis2=2), 1e-8)
     curvature = curvature + (damping[:, None] * size)[:, None] * np.eye(len(prior))
     fine = np.isfinite(seen.cost) & np.all(np.isfinite(gradient), axis=1)
     step = np.zeros_like(seen.theta)
     step[fine] = -np.linalg.solve(curvature[fine], gradient[fine][..., None])[..., 0]
+    # Beyond a prior standard deviation the linear model of the residuals is worth nothing.
     return step * np.minimum(
         1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300)
     )

@@ -2,22 +2,19 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, Unpack
 
 from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
-from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
-from jaxmuscle.model._parameters import proper, proper_values, unknown_parameter
+from jaxmuscle.model._parameters import proper, unknown_parameter
 from jaxmuscle.model._rungs import RUNGS, on_rung
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import (
     DAMPING,
     MASSES,
-    FitOptions,
     Plan,
     base_of,
     check_quantity,
@@ -30,6 +27,7 @@ from jaxmuscle.objective._arguments import (
     task_for,
 )
 from jaxmuscle.objective._derived import MEAN
+from jaxmuscle.objective._options import FitOptions, SimulationOptions
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._scaling import at_force, is_scalable, times_force
 
@@ -42,29 +40,16 @@ Tasks = dict[str, AbstractTask]
 FAR = 0.1  # of a stated mean force
 
 
-def fit_joint(  # noqa: PLR0913 (options of a public call)
+def fit_joint(
     targets: Mapping[str, Any],
     *,
     tasks: Mapping[str, AbstractTask] | None = None,
     separate: Iterable[str] = (),
     proportional: Iterable[str] = (),
-    free: Iterable[str] | None = None,
-    fix: Mapping[str, float] | None = None,
-    noise: str | AbstractNoise | None = None,
-    starts: int = 32,
-    seeds: int = 32,
-    check_seeds: int = 0,
-    key: Key = 0,
-    residual: str = "log",
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    priors: Mapping[str, float | None] | None = None,
-    coefficient_of_variation: bool = True,
     mean_force: Mapping[str, tuple[float, float]] | None = None,
-    max_steps: int = 40,
-    increments: str = "gaussian",
     progress: bool | Callable[[str, float], None] = False,
-    rungs: int = 0,
     answer: Callable[[FitResult], None] | None = None,
+    **options: Unpack[SimulationOptions],
 ) -> FitResult:
     """Fit several spectra of the same person with shared parameters: two force levels, or force and
     displacement.
@@ -89,12 +74,11 @@ def fit_joint(  # noqa: PLR0913 (options of a public call)
     - `free`: names to fit, "P_w@high" for one target's (default as in `fit`)
     - `fix` {name or "name@target": value}
     - `noise` of all tasks
-    - `starts`: as in `fit`
-    - `seeds` of the nonlinear correction (0: none)
+    - `starts`: as in `fit` (32)
+    - `seeds` of the nonlinear correction (32; 0: none)
     - `check_seeds`: fresh seeds of the nonlinear model for each reported spectrum (0: linear
       response times the correction)
-    - `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`, `increments`,
-      `progress`: as in `fit`
+    - `bounds`, `priors`, `key`, `coefficient_of_variation`, `max_steps`, `progress`: as in `fit`
     - `mean_force` {target: (value, sd)} [N]: means as further data, of tasks that you have scaled
       (`at_force`). By default, if no `tasks` are given, the means that the targets state in
       newtons: then all tasks are scaled by one number, to the first of these means, and every
@@ -110,20 +94,9 @@ def fit_joint(  # noqa: PLR0913 (options of a public call)
     **Raises:** `ValueError` for no targets, names that no target, task or parameter has, tasks that
     contradict each other in what they share, and what `fit` refuses.
     """
-    options = FitOptions(
-        free=free,
-        fix=fix,
-        residual=residual,
-        starts=starts,
-        seeds=seeds,
-        check_seeds=check_seeds,
-        key=key,
-        bounds=bounds,
-        priors=priors,
-        coefficient_of_variation=coefficient_of_variation,
-        max_steps=max_steps,
-        increments=increments,
-    )
+    usual = {"starts": 32, "seeds": 32, "check_seeds": 0}
+    asked = FitOptions.of(fit_joint, SimulationOptions, usual | dict(options))
+    rungs = asked.rungs or 0
     loaded = _loaded(targets, tasks or {})
     for argument, named in (("tasks", tasks or {}), ("mean_force", mean_force or {})):
         for name in named:
@@ -145,11 +118,11 @@ def fit_joint(  # noqa: PLR0913 (options of a public call)
     def all_models(loaded: dict[str, Target], options: FitOptions) -> Models:
         """The base model, and the richer ones."""
         base, means, carried = (
-            _models(loaded, tasks or {}, noise, proper_values(fix)),
+            _models(loaded, tasks or {}, asked.noise, asked.fix or {}),
             mean_force,
             (),
         )
-        if means is None and not tasks and "P_w" not in map(base_of, fix or ()):
+        if means is None and not tasks and "P_w" not in map(base_of, asked.fix or ()):
             base, means, factor = _at_means(base, loaded)
             carried, options = tuple(means), dataclasses.replace(options, carried=factor)
 
@@ -171,7 +144,7 @@ def fit_joint(  # noqa: PLR0913 (options of a public call)
         return Models(first, 0, rungs, plan_at, renewed if moved else None)
 
     with told(progress, f"fitting {', '.join(loaded)}") as tell, fitting():
-        models = all_models(loaded, dataclasses.replace(options, progress=tell))
+        models = all_models(loaded, dataclasses.replace(asked, progress=tell))
         result = search(models.plan_at(models.first), answer, models if rungs else None)
     left_out = () if mean_force is not None or not tasks else _far_from_means(result)
     return dataclasses.replace(result, notices=(*result.notices, *left_out))
@@ -278,7 +251,10 @@ def _any_moved(targets: Mapping[str, Target]) -> bool:
 
 
 def _models(
-    targets: dict[str, Target], tasks: Mapping[str, AbstractTask], noise: Any, fix: dict[str, float]
+    targets: dict[str, Target],
+    tasks: Mapping[str, AbstractTask],
+    noise: Any,
+    fix: Mapping[str, float],
 ) -> Tasks:
     """Every target's task with its noise, its fixed values and the target's settings."""
     found, fixed = (

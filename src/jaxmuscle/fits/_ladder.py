@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -14,9 +15,10 @@ from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.model._resonant_noise import narrow_resonances
 from jaxmuscle.model._rungs import QUIET, RICHER, rung_name
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._arguments import FitOptions, Plan
+from jaxmuscle.objective._arguments import Plan
 from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import log_marginal, measured_bins
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._starts import (
     continued,
     kinds_of_starts,
@@ -24,30 +26,15 @@ from jaxmuscle.objective._starts import (
     starting_points,
 )
 
-from ._adequacy import ADEQUATE, Endpoint, rows_of
+from ._adequacy import Endpoint, rows_of
 from ._checks import Stage
+from ._fit_file import ADEQUATE, Rung
 from ._harmonic_evidence import SIGNIFICANT, p_of_line_left_out
 from ._peaks import find_slower_peak, find_tremor
 
 STARTS = 32
 ALIKE = 2.0
 DESCENDED = 0.6  # a fit's progress when its descents have ended
-
-
-class Rung(NamedTuple):
-    """A model that was tried: its `number` on the ladder and `model` in words; what it reached.
-
-    `aic`, `-2 ln L + 2 p` with p, `parameters`, the effective number; chi² per bin and `p` of the
-    verdict; whether it was `chosen`.
-    """
-
-    number: int
-    model: str
-    aic: float
-    parameters: float
-    chi2_per_bin: float
-    p: float
-    chosen: bool = False
 
 
 class Climbed(NamedTuple):
@@ -147,7 +134,7 @@ def climb(
         elif best.rung.p >= ADEQUATE and not (number == QUIET and _shows_line(best)):
             break
     in_order = sorted(tried, key=lambda each: each.rung.number)
-    return tuple(each.rung._replace(chosen=each is best) for each in in_order)
+    return tuple(msgspec.structs.replace(each.rung, chosen=each is best) for each in in_order)
 
 
 def is_narrow(found: Climbed) -> bool:
@@ -207,7 +194,8 @@ def rung_of(ended: Endpoint, number: int) -> Rung:
         max(len(part.target.bins) - 1, 0) + (0 if part.points is None else 2 * len(part.points))
         for part in ended.problem.parts
     ]
-    return Rung(number, rung_name(number), aic, parameters, verdict.chi2 / sum(numbers), verdict.p)
+    each = verdict.chi2 / sum(numbers)
+    return Rung(number, rung_name(number), aic, parameters, each, verdict.p, chosen=False)
 
 
 def criterion(ended: Endpoint) -> tuple[float, float]:

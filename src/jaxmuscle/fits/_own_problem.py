@@ -1,8 +1,8 @@
 """A fit as functions of numbers, for optimisers and samplers of one's own."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Any, Literal, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -14,16 +14,16 @@ from jaxmuscle._common.cards import Card, Shown
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.data._as_target import as_target
-from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import proper_values
 from jaxmuscle.model._task import require_task
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
+from jaxmuscle.objective._arguments import at_mean, planned
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._coordinates import task_at
 from jaxmuscle.objective._likelihood import Likelihood, require_spread
 from jaxmuscle.objective._moment_models import Linear
+from jaxmuscle.objective._options import DataOptions, FitOptions
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
 from jaxmuscle.response._expected import Moments
@@ -179,18 +179,12 @@ class Problem(Shown):
         return self.fit_problem.coordinates.card(heading)
 
 
-def problem(  # noqa: PLR0913 (options of a public call)
+def problem(
     task: AbstractTask,
     target: Any,
     *,
-    free: Iterable[str] | None = None,
-    fix: Mapping[str, float] | None = None,
-    noise: str | AbstractNoise | None = None,
-    residual: str = "log",
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    priors: Mapping[str, float | None] | None = None,
-    coefficient_of_variation: bool = True,
     mean_force: tuple[float, float] | Literal[False] | None = None,
+    **options: Unpack[DataOptions],
 ) -> Problem:
     """What `fit` minimises, for an optimiser or a sampler of your own: residuals, log density,
     names, start.
@@ -206,28 +200,20 @@ def problem(  # noqa: PLR0913 (options of a public call)
 
     - `task`: the model; its values are the prior's centre. Not traced by JAX
     - `target`: in any form that `fit` takes but a perturbed recording
-    - `free`, `fix`, `noise`, `residual`, `bounds`, `priors`, `coefficient_of_variation`,
-      `mean_force`: as in `fit`
+    - `free`, `fix`, `noise`, `bounds`, `priors`, `coefficient_of_variation`, `mean_force`: as in
+      `fit`
 
     **Returns:** a `Problem`. **Raises:** `ValueError` as `fit` does.
     """
     require_task(task, "problem(task, target)")
     require(
-        all_concrete((task, noise)),
+        all_concrete((task, options.get("noise"))),
         "task: JAX is tracing it (inside jit, grad or vmap), but a problem is made from numbers."
         " Make it outside, and give its functions what changes:"
         " problem.log_density(problem.theta({'k_w': ...}))",
     )
     target = as_target(target)
     with jax.enable_x64(True):
-        options = FitOptions(
-            free=free,
-            fix=fix,
-            residual=residual,
-            bounds=bounds,
-            priors=priors,
-            coefficient_of_variation=coefficient_of_variation,
-            mean_force=mean_force,
-        )
-        task, options = at_mean(with_noise(task, noise, options.fix), target, options)
-        return Problem.of(planned(task, target, options).problem)
+        given = FitOptions.of(problem, DataOptions, options, mean_force=mean_force)
+        task, given = at_mean(with_noise(task, given.noise, given.fix), target, given)
+        return Problem.of(planned(task, target, given).problem)

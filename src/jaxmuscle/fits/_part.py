@@ -17,9 +17,8 @@ from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._derived import MEAN
-from jaxmuscle.objective._starts import SPREAD
 
-from ._fit_file import EstimateTable, PartTable, check_lengths
+from ._fit_file import EstimateTable, PartTable
 
 if TYPE_CHECKING:
     import pandas
@@ -105,22 +104,6 @@ class Estimate(Shown, eqx.Module):
         if low is None or high is None or end == 0 or not 0 < high - low < math.inf:
             return 3
         return max(3, math.floor(math.log10(abs(end))) - math.floor(math.log10(high - low)) + 1)
-
-
-class Start(eqx.Module):
-    """One start of a fit: final cost `½ Σ r²` (None if not finite), `success`, steps taken.
-
-    `success`: whether its last step lowered the cost by less than a thousandth of it. `values`,
-    where the free parameters ended, in the order of `settings["free"]`; empty where that is not
-    finite. `kind`, how it began: "peak", at a peak of the spectrum; "response", at the measured
-    one; "other model", where that one ended; "own values" of the task; else "spread".
-    """
-
-    cost: float | None
-    success: bool
-    steps: int
-    values: tuple[float, ...] = ()
-    kind: str = SPREAD
 
 
 class FittedPart(eqx.Module):
@@ -343,7 +326,6 @@ def read_part(table: PartTable) -> FittedPart:
     """The reverse of `part_to_table`."""
     spectrum, stretch, stiffness = table.spectrum, table.stretch, table.stiffness
     target = Target.from_table(table.target_table, whole=True)
-    check_lengths(table, target)
     return FittedPart(
         target=target,
         task=task_from_table(table.task_table, whole=True),

@@ -16,8 +16,9 @@ from jaxmuscle.data._two_channels import perturbed_recordings
 from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.model._rungs import is_base
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
-from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
+from jaxmuscle.objective._arguments import at_mean, planned
 from jaxmuscle.objective._least_squares import least_squares
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._starts import starting_points
 from jaxmuscle.response._input_response import dynamic_stiffness
 from jaxmuscle.simulation._driven import driven

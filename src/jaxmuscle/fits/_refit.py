@@ -15,9 +15,11 @@ from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.objective._residuals import Residuals
 from jaxmuscle.response._rows import line_levels
 
-LINES = 128
+LINES = 128  # frequencies, at least
 # residuals whose costs are found at a time: what lies in the directions of all lines is large
 CHUNK = 100
+# Mean squares of lines, over the noise of the bin where each is strongest. A weaker one moves that
+# bin by half a per cent; of a stronger one the bin is all line, and its log power moves alike.
 STRENGTHS = np.geomspace(0.005, 20.0, 20)
 
 
@@ -45,6 +47,8 @@ class Refit(NamedTuple):
         """`|(1 - U Uᵀ) (r - change)|²` with the penalty, less `|r|²`; the largest of its terms in
         single precision."""
         own, (_, size, fitted) = residuals @ self.narrow, self.taken.shape
+        # Multiplied out: |r|² falls away, the rest is one product for all rows and lines. Squares
+        # of what is taken up are sums of like signs, so single precision serves.
         held = np.einsum("la,lak->lk", self.change, self.taken)
         away = self.change - np.einsum("lak,lk->la", self.taken, held)
         columns = np.transpose(self.taken.astype(np.float32), (1, 2, 0)).reshape(size, -1)
@@ -82,7 +86,7 @@ def refit_of(
     jacobian, turn = _narrowed(objective, found.jacobian)
     found = found._replace(residuals=turn.T @ found.residuals, jacobian=jacobian)
     power, line = np.asarray(moments.power), np.asarray(moments.line)
-    alone = len(problem.parts) == 1 and len(free) == 2 and problem.residual == "log"
+    alone = len(problem.parts) == 1 and len(free) == 2
     if not (alone and np.all(power > line) and np.any(line > 0)):
         taken = taken_up(np.concatenate([found.jacobian, prior]))[None]
         return Refit(
@@ -113,14 +117,17 @@ def refit_of(
     change[:, :bins] = (logs - logs.mean(axis=1, keepdims=True)) / spread
     rise = (slopes.power - slopes.line)[:, kept] / total[..., None]
     jacobian[:, :bins] = (rise.mean(axis=1, keepdims=True) - rise) / spread[:, None]
+    # What no line changes: the further residuals keep their slopes.
     jacobian[:, bins:count] = found.jacobian[bins:, kept]
     if own.data.variation is not None:
         error, variance = float(own.data.variation[1]), float(moments.variance)
+        # Without the fitted line the rest may be nothing but rounding, whose log would be -∞.
         other = np.maximum(variance + square - held, 1e-6 * variance)
         change[:, bins] = -0.5 * np.log(other / variance) / error
         moved = (slopes.variance[kept] - held * level) / other[:, None]
         jacobian[:, bins] = (0.5 * moved - slopes.mean[kept] / float(moments.mean)) / error
-    # Of two lines of one frequency the mean square goes with the squared amplitude.
+    # The prior's residual of the amplitude: of two lines of one frequency the mean square goes with
+    # the squared amplitude, of two frequencies with the gain of the muscle, too.
     louder = 0.5 * (np.log(square / held) - np.log(tried.gain / tried.gain[-1])) / sd[a]
     change[:, -1] = -prior[a, a] * louder
     jacobian[:, count:-1] = prior[np.ix_(kept, kept)]
@@ -146,9 +153,7 @@ def _narrowed(
     turns, start = [], 0
     for part in objective.parts:
         points = 0 if part.model.points is None else 2 * len(part.model.points)
-        rows = (
-            part.data.further - points + len(part.statistics.sd) - (part.residual == "cumulative")
-        )
+        rows = part.data.further - points + len(part.statistics.sd)
         turns.append(np.eye(rows))
         start += rows
         if points:

@@ -10,7 +10,8 @@ from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS, proper_names, proper_values
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._arguments import DAMPING, FitOptions, base_of, planned, target_of
+from jaxmuscle.objective._arguments import DAMPING, base_of, planned, target_of
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.response._second_order import warn_beyond
@@ -81,7 +82,6 @@ def reopened(
             )
     options = FitOptions(
         free=names,
-        residual=settings["residual"],
         key=key,
         bounds=limits,
         priors=sds,

@@ -23,7 +23,6 @@ from jaxmuscle.response._expected import Moments, check_power
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._linearised import settled
 from jaxmuscle.response._second_order import negative_coefficients, second_order
-from jaxmuscle.simulation._simulate import simulate
 from jaxmuscle.spectra._bin_law import (
     bin_statistics,
     recorded_interval,
@@ -49,9 +48,9 @@ from ._checks import (
     twitch_notices,
     unsettled,
 )
+from ._fit_file import Rung, Start
 from ._harmonic_evidence import harmonic_test
-from ._ladder import Rung
-from ._part import FittedPart, Start
+from ._part import FittedPart
 from ._peaks import find_unseen
 from ._result import FitResult
 from ._tables import (
@@ -264,15 +263,11 @@ def _simulated(problem: FitProblem, part: Part, task: AbstractTask, seeds: int) 
     """Of fresh seeds of the nonlinear model."""
     still = settled(task) if problem.control else task
     key = fold_in(problem.key, 1)
-    runs = runs_for_means(still, key, seeds, problem.draws)
+    runs = runs_for_means(still, key, seeds)
     each, expected = controlled_moments(runs, part.target, task)
     each = each._replace(power=np.asarray(each.power)[:, part.chosen])
     start = round((runs.time[-1] - STRETCH) * runs.rate)
-    # A path of weak numbers is none to look at.
-    output = (
-        runs.output[0] if problem.draws.increments == "gaussian" else simulate(still, key).output
-    )
-    stretch = runs.time[start:], np.asarray(output)[start:]
+    stretch = runs.time[start:], np.asarray(runs.output[0])[start:]
     return _Made(
         each, None if expected is None else np.asarray(expected.power)[part.chosen], stretch
     )

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -25,7 +26,8 @@ from jaxmuscle.response._linearised import settled
 
 from ._adequacy import Endpoint
 from ._checks import AMBIGUOUS, Stage, controlled_moments, seen_best
-from ._ladder import Climbed, Models, Rung, climb, rung_of
+from ._fit_file import Rung
+from ._ladder import Climbed, Models, climb, rung_of
 from ._report import UNCHECKED, report_fit
 from ._result import FitResult
 
@@ -214,9 +216,9 @@ def search_together(
         finite = np.isfinite(stages[-1].minima.cost[stages[-1].minima.best])
         ended = Endpoint.of(plan.problem, stages[-1]) if finite else None
         judged = ended is not None and ended.adequacy is not None and len(plan.problem.parts) == 1
-        rungs = (
-            (rung_of(ended, number)._replace(chosen=True),) if ended is not None and judged else ()
-        )
+        rungs = ()
+        if ended is not None and judged:
+            rungs = (msgspec.structs.replace(rung_of(ended, number), chosen=True),)
         results.append(
             report_fit(plan._replace(settings=unused, check_seeds=0), stages, rungs, ended=ended)
         )
@@ -345,7 +347,7 @@ def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moment
     if not len(part.target.bins):
         return part.ones
     try:
-        runs = runs_for_means(settled(task), fold_in(problem.key, 2), problem.seeds, problem.draws)
+        runs = runs_for_means(settled(task), fold_in(problem.key, 2), problem.seeds)
     except (SimulationError, ValueError):
         return None  # the check on fresh seeds meets the same error and reports it
     each, expected = controlled_moments(runs, part.target, task)

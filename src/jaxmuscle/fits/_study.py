@@ -10,7 +10,7 @@ import tempfile
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
 import equinox as eqx
 import numpy as np
@@ -31,6 +31,7 @@ from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_stud
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._derived import DERIVED
+from jaxmuscle.objective._options import check_options
 
 from ._cohort import CohortResult, fit_cohort
 from ._differences import CORRECTIONS, Difference, Number, change, corrected, difference, paired
@@ -411,35 +412,42 @@ def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
     }
 
 
-def run_study(  # noqa: PLR0913 (options of a public call)
+class StudyOptions(TypedDict, total=False):
+    """What a study's table may also say: the model and the statistics, and how files are read where
+    a row does not say it (None: as if left out)."""
+
+    rung: int | str | None
+    noise: str | None
+    quantities: Iterable[str] | None
+    alpha: float | None
+    correction: str | None
+    window: Sequence[float | int] | str | None
+    column: str | int | None
+    rate: float | int | None
+    units: str | None
+    axis: str | None
+    reference: str | int | None
+    time: str | int | None
+    skip_rows: int | None
+    sheet: str | int | None
+    max_gap: float | int | None
+    outliers: str | None
+    lever_arm: float | int | None
+    quantity: str | None
+    baseline: str | Sequence[float | int] | None
+    detrend: bool | None
+    spectrum: str | None
+    mvc: float | int | None
+
+
+def run_study(
     study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]",
     *,
     fit: bool = True,
-    rung: int | str | None = None,
-    noise: str | None = None,
-    quantities: Iterable[str] | None = None,
-    alpha: float | None = None,
-    correction: str | None = None,
     starts: int = 32,
     key: Key = 0,
     progress: bool | Tell = False,
-    window: Sequence[float | int] | str | None = None,
-    column: str | int | None = None,
-    rate: float | int | None = None,
-    units: str | None = None,
-    axis: str | None = None,
-    reference: str | int | None = None,
-    time: str | int | None = None,
-    skip_rows: int | None = None,
-    sheet: str | int | None = None,
-    max_gap: float | int | None = None,
-    outliers: str | None = None,
-    lever_arm: float | int | None = None,
-    quantity: str | None = None,
-    baseline: str | Sequence[float | int] | None = None,
-    detrend: bool | None = None,
-    spectrum: str | None = None,
-    mvc: float | int | None = None,
+    **options: Unpack[StudyOptions],
 ) -> StudyResult:
     """Measure the recordings of a whole study, fit them with one model, and compare groups and
     conditions.
@@ -489,47 +497,20 @@ def run_study(  # noqa: PLR0913 (options of a public call)
     **Raises:** `ValueError` naming file, line and column, or the argument, and the remedy.
     """
     check_key(key)
-    reading = {
-        "window": window,
-        "column": column,
-        "rate": rate,
-        "units": units,
-        "axis": axis,
-        "reference": reference,
-        "time": time,
-        "skip_rows": skip_rows,
-        "sheet": sheet,
-        "max_gap": max_gap,
-        "outliers": outliers,
-        "lever_arm": lever_arm,
-        "quantity": quantity,
-        "baseline": baseline,
-        "detrend": detrend,
-        "spectrum": spectrum,
-        "mvc": mvc,
-    }
+    check_options(run_study, StudyOptions, options)
     table = read_study(study)
-    given = {
-        "rung": rung,
-        "noise": noise,
-        "quantities": quantities,
-        "alpha": alpha,
-        "correction": correction,
-    } | reading
-    options = (
-        USUAL | table.options | {name: value for name, value in given.items() if value is not None}
-    )
-    options = _checked(options)
-    usual = {name: options.pop(name) for name in READING if name in options}
-    options = options | {"starts": starts, "key": key}
+    given = {name: value for name, value in options.items() if value is not None}
+    used = _checked(USUAL | table.options | given)
+    usual = {name: used.pop(name) for name in READING if name in used}
+    used = used | {"starts": starts, "key": key}
     with told(progress, f"study of {len({row.person for row in table.rows})} people") as tell:
         tell("reading recordings", 0.0)
         cells = cells_of_study(table.rows, usual)
-        if options["rung"] is None:
+        if used["rung"] is None:
             fewest = min(cell.trials for cell in cells)
-            options["rung"] = 3 if fewest >= TRIALS_OF_TWO else 2
-        cohort, aic = _fitted(cells, options, tell) if fit else (CohortResult({}, {}, {}), {})
-    return StudyResult(cohort, tuple(cells), aic, options | {"reading": usual}, table.source)
+            used["rung"] = 3 if fewest >= TRIALS_OF_TWO else 2
+        cohort, aic = _fitted(cells, used, tell) if fit else (CohortResult({}, {}, {}), {})
+    return StudyResult(cohort, tuple(cells), aic, used | {"reading": usual}, table.source)
 
 
 def _checked(options: dict[str, Any]) -> dict[str, Any]:

@@ -17,10 +17,13 @@ Increments = Literal["gaussian", "weak"]
 # once
 VERSION = 2
 START = np.uint32(0xFFFFFFFF)  # the step before the first, which draws where a noise begins
-APART = 1024  # numbers of a step that one noise of a sum may take
+# Numbers of a step that one noise of a sum may take: so the next one begins at the same place
+# whatever the first one uses, and its numbers do not change with it.
+APART = 1024
 
+# 2³² over the golden ratio: its multiples are spread over all words as evenly as can be (Weyl).
 _GOLDEN = 0x9E3779B9
-_BYTES = 4
+_BYTES = 4  # in a word, each of which makes a weak number
 
 # The normal quantile as odd function of x = 1 - 2 tail: x P(L) / Q(L), L = -log(1 - x²). Minimax
 # fit of the relative error up to L = 22.3, |z| = 6.4: 1.6e-5.
@@ -28,7 +31,8 @@ _P = (1.253295, 0.44145788, 0.084870878, 0.010199065, 4.4658263e-5)
 _Q = (1.0, 0.090186474, 0.031676926, 7.8426951e-4)
 # log(1 + m) / m for m from √½ - 1 to √2 - 1, 2e-7.
 _LOG = (1.0000032, -0.50001965, 0.33303295, -0.24881325, 0.20604704, -0.18902126, 0.11827557)
-# Moments 2, 4 and 6 of x (a + b x² + c x⁴), x = (byte - 127.5) / 128, are those of a normal.
+# Moments 2, 4 and 6 of x (a + b x² + c x⁴), x = (byte - 127.5) / 128, are those of a normal; odd
+# ones vanish by symmetry. A scheme of weak order 2 needs moments up to the fifth.
 _WEAK = (2.79678067, -6.70456644, 6.73654793)
 
 
@@ -130,6 +134,8 @@ class Stream(eqx.Module):
         )
 
 
+# Shift down, then multiply up, so that every bit moves every other; odd factors, since only these
+# have an inverse modulo 2³². Shifts and factors are those of least bias that Wellons found.
 def _mix2(x: Array) -> Array:
     x = (x ^ (x >> jnp.uint32(16))) * jnp.uint32(0x7FEB352D)
     x = (x ^ (x >> jnp.uint32(15))) * jnp.uint32(0x846CA68B)

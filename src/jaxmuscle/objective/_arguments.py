@@ -3,18 +3,15 @@
 import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle._common.arguments import count, positive, require
+from jaxmuscle._common.arguments import require
 from jaxmuscle._common.arrays import as_numbers, with_nulls
-from jaxmuscle._common.keys import check_key, key_of, number_of
-from jaxmuscle._common.progress import Tell, nothing
-from jaxmuscle._common.text import choices
-from jaxmuscle._common.types import Key
+from jaxmuscle._common.keys import key_of
 from jaxmuscle.data._frequency_response import check_seen
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
@@ -23,12 +20,9 @@ from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import (
     PARAMETERS,
     USUALLY_FREE,
-    proper_names,
-    proper_values,
     unknown_parameter,
     usually_free,
 )
-from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import (
     AbstractTask,
     Isometric,
@@ -42,14 +36,9 @@ from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
 from jaxmuscle.spectra._settings import WINDOW, samples_in
 
 from ._coordinates import Coordinates
-from ._given import check_data, check_named
-from ._least_squares import check_optimiser
+from ._options import FitOptions
 from ._problem import FitProblem, Part, target_variation
 
-RESIDUALS = ("log", "linear", "cumulative")
-METHODS = ("linear", "montecarlo")
-MOST = 10**9  # of starts, seeds and steps: what is more is a slip
-DT = 2.5e-3
 COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
 # of the prior of ln ζ. Small movements of active human muscle, twitch and tissue together, follow a
 # second-order response with two real time constants, 50 ms each (Zahalak & Heyman 1979,
@@ -161,73 +150,6 @@ def check_names(argument: str, names: Iterable[str], known: Iterable[str]) -> No
             )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FitOptions:
-    """How a fit is done: what `fit` and `fit_joint` are asked for, by the names of their arguments.
-
-    `also_free`: what is free besides `free`, whatever that is; `carried`, by which number the task
-    was multiplied to come to a measured mean force.
-    """
-
-    free: Iterable[str] | None = None
-    fix: Mapping[str, float] | None = None
-    method: str = "linear"
-    residual: str = "log"
-    starts: int | None = None
-    seeds: int | None = None
-    check_seeds: int | None = None
-    key: Key = 0
-    bounds: Mapping[str, tuple[float, float]] | None = None
-    priors: Mapping[str, float | None] | None = None
-    coefficient_of_variation: bool = True
-    mean_force: tuple[float, float] | Literal[False] | None = None
-    also_free: tuple[str, ...] = ()
-    carried: float | None = None
-    max_steps: int = 40
-    dt: float = DT
-    rungs: int | None = None
-    progress: Tell = nothing
-    optimiser: Any = None
-    increments: str = "gaussian"
-
-    def __post_init__(self) -> None:
-        check_named(self.free, self.fix, self.bounds, self.priors)
-        named = {"free": proper_names(self.free)}
-        named |= {name: proper_values(getattr(self, name)) for name in ("fix", "bounds", "priors")}
-        for name, value in named.items():
-            object.__setattr__(self, name, value)
-        if self.optimiser is not None:
-            check_optimiser(self.optimiser)
-        for name, known in (("method", METHODS), ("residual", RESIDUALS)):
-            if getattr(self, name) not in known:
-                raise ValueError(
-                    f"{name} = {getattr(self, name)!r}: {choices(getattr(self, name), known)}"
-                )
-        for name, least in (
-            ("starts", 1),
-            ("seeds", 0),
-            ("check_seeds", 0),
-            ("max_steps", 1),
-            ("rungs", 0),
-        ):
-            if getattr(self, name) is not None:
-                count(name, getattr(self, name), least, MOST)
-        check_key(self.key)
-        _ = self.draws  # its check
-        positive("dt", self.dt)
-        check_data(self.coefficient_of_variation, self.mean_force)
-
-    @property
-    def draws(self) -> Draws:
-        """Random numbers of what is simulated. **Raises:** `ValueError` for unknown increments."""
-        return Draws.of(Draws().generator, self.increments)
-
-    @property
-    def seed(self) -> int | None:
-        """The key, if it was given as a number."""
-        return number_of(self.key)
-
-
 def at_mean(
     task: AbstractTask, target: Target, options: FitOptions
 ) -> tuple[AbstractTask, FitOptions]:
@@ -335,15 +257,12 @@ def planned(
         (part,),
         coordinates,
         prior,
-        options.residual,
         options.method,
         options.dt,
         key,
         counts["seeds"],
         control,
         options.progress,
-        options.optimiser,
-        options.draws,
         # else a muscle could swing as a tremor does; a response tells that apart
         damping_row(task, coordinates, None if moved or task.activation is None else damping),
     )
@@ -352,7 +271,6 @@ def planned(
         **counts,
         "max_steps": options.max_steps,
         "dt": options.dt,
-        "increments": options.increments,
         "coefficient_of_variation": variation is not None,
         "mean_force": None if mean is None else list(mean),
         "damping_ratio_sd": damping if problem.damping else None,
@@ -360,8 +278,6 @@ def planned(
         "spectrum": target.settings.to_dict(),
         "steps_per_sample": problem.steps_per_sample,
     }
-    if options.optimiser is not None:
-        settings["optimiser"] = type(options.optimiser).__name__
     return Plan(
         problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed
     )
@@ -426,7 +342,6 @@ def settings_of(problem: FitProblem, bounds: Mapping[str, tuple[float, float]]) 
     c = problem.coordinates
     return {
         "free": list(c.names),
-        "residual": problem.residual,
         "prior_centre": dict(zip(c.names, map(float, c.centre), strict=True)),
         "prior_sd": {
             n: float(sd) if p else None

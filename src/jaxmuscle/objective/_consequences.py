@@ -16,7 +16,7 @@ from jaxmuscle.model._parameters import paths_of, set_parameters
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.response._linearised import Near, in_parts, value_and_slopes
+from jaxmuscle.response._mechanics import Near, in_parts, value_and_slopes
 from jaxmuscle.response._rows import mechanical_rows
 from jaxmuscle.response._transfer import half_power_level
 
@@ -226,14 +226,13 @@ def _of_spectra(
     )
     settings = part.task.settings
     given = as_arrays((settings.frequency[part.model.chosen], settings.resolution))
-    program = functools.partial(_spectra, part.residual, part.data, *given)
+    program = functools.partial(_spectra, part.data, *given)
     values, slopes = in_parts(program, filled(seen.moments), slopes, np.stack(peaks, axis=1))
     return values, jax.tree.map(lambda x: x[..., :free], slopes)
 
 
 @kept
 def _spectra(
-    residual: str,
     data: Data,
     frequency: Float[Array, " bins"],
     resolution: Float[Array, ""],
@@ -245,7 +244,7 @@ def _spectra(
         def found(away):
             near = jax.tree.map(lambda x, slope: x + slope @ away, moments, slopes)
             return (
-                data_residuals(residual, near, data),
+                data_residuals(near, data),
                 of_spectrum(near, frequency, resolution, peaks),
             )
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxmuscle.data._target import Target
-from jaxmuscle.spectra._bin_law import log_power_moments, shares_map, welch_law
+from jaxmuscle.spectra._bin_law import log_power_moments, welch_law
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._moment_models import MonteCarlo
@@ -224,7 +224,8 @@ def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) 
     simulated = sd[:, None] * law.correlation * sd
     measured = part.statistics.covariance
     p = np.asarray(target.proportional_power)
-    spread = _spread_map(part, p)
+    # how the residuals of the spectrum move with the log powers
+    spread = (np.eye(len(p)) - 1 / len(p)) / part.statistics.sd[:, None]
     total = spread @ (measured + simulated) @ spread.T
     if variation is not None:
         rows[0] += 0.25 * float(p @ simulated @ p) / float(variation[1]) ** 2
@@ -234,13 +235,3 @@ def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) 
             [np.zeros((len(rows), len(total))), np.diag(rows)],
         ]
     )
-
-
-def _spread_map(part: PartResiduals, p: np.ndarray) -> np.ndarray:
-    """How the spectrum's residuals move with the log powers."""
-    n = len(p)
-    if part.residual == "log":
-        return (np.eye(n) - 1 / n) / part.statistics.sd[:, None]
-    if part.residual == "linear":
-        return shares_map(p) / part.data.sigma[:, None]
-    return (np.tril(np.ones((n, n))) @ shares_map(p) / part.data.sigma[:, None])[:-1]

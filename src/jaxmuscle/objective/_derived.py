@@ -16,7 +16,7 @@ from jaxmuscle.model._signals import AbstractSignal
 from jaxmuscle.model._tasks import PrescribedLength
 from jaxmuscle.response._equilibrium import HOLD, slowest
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.response._linearised import Operating
+from jaxmuscle.response._mechanics import Operating
 from jaxmuscle.response._transfer import half_power_frequency
 from jaxmuscle.spectra._fluctuations import BANDS, EDGES, in_bands
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmuscle._common.programs import kept
-from jaxmuscle.response._linearised import in_parts
+from jaxmuscle.response._mechanics import in_parts
 
 from ._consequences import Expansion, expand
 from ._residuals import free_size
@@ -49,31 +49,16 @@ def _residuals(
     return objective.residuals(theta, seen.near(theta), data), None
 
 
-def _solver(objective: Any) -> Any:
-    if objective.optimiser is not None:
-        return objective.optimiser
+def _solver() -> Any:
     import optimistix as optx  # only here, since a program that is loaded does without
 
     return optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
 
 
-def check_optimiser(optimiser: Any) -> None:
-    """Raise a `ValueError` for what is not one of optimistix's solvers of the Gauss-Newton kind."""
-    import optimistix as optx
-
-    if not isinstance(optimiser, optx.AbstractGaussNewton):
-        given = optimiser.__name__ if isinstance(optimiser, type) else type(optimiser).__name__
-        raise ValueError(
-            f"optimiser: this is {given}; give a least-squares solver of optimistix that makes"
-            " Gauss-Newton steps, as optimistix.Dogleg(1e-9, 1e-9); for any other there is"
-            " jaxmuscle.problem(task, target)"
-        )
-
-
 def _initial(objective, data, s, seen):
     given = (objective, data, seen)
     shape = jax.eval_shape(lambda s: _residuals(s, given)[0], s)
-    return _solver(objective).init(_residuals, s, given, {}, shape, None, frozenset())
+    return _solver().init(_residuals, s, given, {}, shape, None, frozenset())
 
 
 @kept
@@ -91,9 +76,7 @@ def _step(objective, data, s, state, seen):
             eqx.filter_eval_shape(_initial, objective, data, s, seen), _is_shape
         )
         state = eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), state), functions)
-        s, state, _ = _solver(objective).step(
-            _residuals, s, (objective, data, seen), {}, state, frozenset()
-        )
+        s, state, _ = _solver().step(_residuals, s, (objective, data, seen), {}, state, frozenset())
         return (
             s,
             _arrays(state),

@@ -229,7 +229,7 @@ class Likelihood(eqx.Module):
         """Log density of one target's data and offset."""
         if bins is None:
             part = self.objective.parts[i]
-            return _gaussian(data_residuals(part.residual, moments, part.data))
+            return _gaussian(data_residuals(moments, part.data))
         return log_density(bins, moments.power, moments.line, offset) + self.further(i, moments)
 
     def further(self, i: int, moments: Moments) -> Scalar:
@@ -243,7 +243,7 @@ class Likelihood(eqx.Module):
             self.objective.parts, moments, self.bins if bins is None else bins, strict=True
         ):
             if own is None:
-                found += _gaussian(data_residuals(part.residual, m, part.data))
+                found += _gaussian(data_residuals(m, part.data))
             else:
                 found += log_marginal(own, m.power, m.line) + _gaussian(
                     further_residuals(m, part.data)
@@ -263,7 +263,7 @@ class Likelihood(eqx.Module):
             def rows(theta, i=i, part=part, own=own):
                 moments = seen.near(theta)[i]
                 return (
-                    data_residuals(part.residual, moments, part.data)
+                    data_residuals(moments, part.data)
                     if own is None
                     else further_residuals(moments, part.data)
                 )

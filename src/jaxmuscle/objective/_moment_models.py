@@ -15,12 +15,13 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments, response
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._input_response import parts_of_stiffness
-from jaxmuscle.response._linearised import LinearTask, settled
+from jaxmuscle.response._linear_task import Linearisation, LinearTask
+from jaxmuscle.response._linearised import settled
 from jaxmuscle.response._rows import Sampling, moments_of_rows
 from jaxmuscle.simulation._batch import streams_of
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_rows
-from jaxmuscle.spectra._settings import SpectrumSettings, samples_in
+from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import lowpass
 
 
@@ -73,6 +74,10 @@ class Linear(eqx.Module):
         found, system = expected_moments(
             task, task.settings, self.window, self.samples, self.recorded
         )
+        return self.compared(task, found, system)
+
+    def compared(self, task: AbstractTask, found: Moments, system: Linearisation) -> Moments:
+        """What is compared of a task's moments, and its dynamic stiffness."""
         stiffness = () if self.points is None else parts_of_stiffness(task, system, self.points)
         return self._chosen(found._replace(stiffness=stiffness), jnp.multiply)
 
@@ -113,53 +118,44 @@ class MonteCarlo(eqx.Module):
     with the frequency.
     """
 
+    linear: Linear
     streams: Stream
     operator: Float[Array, "parts samples"]
-    chosen: np.ndarray
-    samples: Int[Array | np.ndarray, ""]
     grid: Grid
-    window: tuple[float, float] = eqx.field(static=True)
     control: bool = eqx.field(static=True)
-    points: Float[Array | np.ndarray, " points"] | None = None
-    recorded: Float[Array | np.ndarray, ""] | float = 0.0
 
     @classmethod
-    def of(  # noqa: PLR0913 (all that its paths and bins depend on)
+    def of(
         cls,
+        linear: Linear,
         settings: SpectrumSettings,
         key: PRNGKeyArray,
         seeds: int,
         grid: Grid,
-        chosen: np.ndarray,
-        window: tuple[float, float],
         *,
         control: bool,
-        draws: Draws = Draws(),  # noqa: B008
-        samples: int | None = None,
-        points: Any = None,
-        recorded: float = 0.0,
     ) -> "MonteCarlo":
-        """On seeds 0 to `seeds - 1` of the key; `chosen` are the positions of the compared bins
-        among the settings' bins.
-
-        With a control variate the variance is that of a recording of so many `samples`, by default
-        as many as simulated.
-        """
+        """On seeds 0 to `seeds - 1` of the key; `linear`, what is expected in linear response: its
+        bins and points are those of the paths, and with a control variate its variance, of a
+        recording of so many samples."""
         numbers = jnp.arange(seeds) if control else jnp.maximum(jnp.arange(seeds + 1) - 1, 0)
-        streams = streams_of(key, numbers, draws)
-        operator = welch_operator(settings, grid.steps // grid.every + 1, window)
-        samples = samples_in(window, settings) if samples is None else samples
-        return cls(
-            streams,
-            jnp.asarray(operator),
-            chosen,
-            jnp.asarray(samples),
-            grid,
-            window,
-            control,
-            points,
-            jnp.asarray(recorded),
-        )
+        operator = welch_operator(settings, grid.steps // grid.every + 1, linear.window)
+        return cls(linear, streams_of(key, numbers, Draws()), jnp.asarray(operator), grid, control)
+
+    @property
+    def chosen(self) -> np.ndarray:
+        """Positions of the compared bins among the settings'."""
+        return self.linear.chosen
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """The analysed part [s]."""
+        return self.linear.window
+
+    @property
+    def points(self) -> Float[Array | np.ndarray, " points"] | None:
+        """Frequencies of a measured dynamic stiffness [Hz]."""
+        return self.linear.points
 
     @property
     def seeds(self) -> int:
@@ -184,21 +180,15 @@ class MonteCarlo(eqx.Module):
 
         if self.control:
             task = settled(task)
-            exact, system = response(task, settings, self.window, self.samples, self.recorded)
+            linear = self.linear
+            exact, system = response(task, settings, linear.window, linear.samples, linear.recorded)
+            exact = linear.compared(task, exact, system)
             seen, beside = outputs(None, task, LinearTask.of(task, system))
-            power = exact.power[self.chosen] + jnp.mean(
-                self._power(seen, settings) - self._power(beside, settings), 0
-            )
-            mean, spread = jnp.mean(seen[:, start:stop]), jnp.mean(swing(seen) - swing(beside))
-            resonant = tuple(own[self.chosen] for own in exact.resonant)
-            stiffness = () if self.points is None else parts_of_stiffness(task, system, self.points)
-            return Moments(
-                power,
-                exact.line[self.chosen],
-                mean,
-                exact.variance + spread,
-                resonant,
-                stiffness,
+            more = self._power(seen, settings) - self._power(beside, settings)
+            return exact._replace(
+                power=exact.power + jnp.mean(more, 0),
+                mean=jnp.mean(seen[:, start:stop]),
+                variance=exact.variance + jnp.mean(swing(seen) - swing(beside)),
             )
         (seen,) = outputs(jnp.minimum(jnp.arange(self.seeds + 1.0), 1.0), task)
         mean = jnp.mean(seen[1:, start:stop])

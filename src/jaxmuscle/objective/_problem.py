@@ -15,7 +15,6 @@ from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers, is_con
 from jaxmuscle.data._target import Target
 from jaxmuscle.data._target_data import longest
 from jaxmuscle.model._resonant_noise import ResonantNoise
-from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._expected import Moments
@@ -34,7 +33,7 @@ from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
 from ._coordinates import Coordinates, task_at
 from ._moment_models import Linear, MonteCarlo
-from ._residuals import Data, PartResiduals, Residuals, residual_sigma
+from ._residuals import Data, PartResiduals, Residuals
 
 MOST_SUBSTEPS = 16
 
@@ -145,34 +144,29 @@ class Part:
         return Moments(ones, ones, one, one, resonant, stiffness)
 
     def linear(
-        self, residual: str, share: np.ndarray | None = None, correction: Moments | None = None
+        self, share: np.ndarray | None = None, correction: Moments | None = None
     ) -> PartResiduals:
         """Its residuals in linear response, times a correction of its moments."""
-        known: Moments = jax.tree.map(np.asarray, self.ones if correction is None else correction)
-        samples, recorded = map(
-            np.asarray,
-            (trial_samples(self.target), recorded_interval(self.target, self.target.settings)),
-        )
-        return self.residuals(
-            Linear(self.chosen, known, samples, WINDOW, self.points, recorded), residual, share
-        )
+        return self.residuals(self.expected(correction), share)
 
-    def residuals(
-        self, model: Linear | MonteCarlo, residual: str, share: np.ndarray | None
-    ) -> PartResiduals:
+    def expected(self, correction: Moments | None = None) -> Linear:
+        """The model of its moments in linear response, times a correction."""
+        known: Moments = jax.tree.map(np.asarray, self.ones if correction is None else correction)
+        recorded = recorded_interval(self.target, self.target.settings)
+        samples, recorded = np.asarray(trial_samples(self.target)), np.asarray(recorded)
+        return Linear(self.chosen, known, samples, WINDOW, self.points, recorded)
+
+    def residuals(self, model: Linear | MonteCarlo, share: np.ndarray | None) -> PartResiduals:
         """Its residuals with a model of its moments; `share` is what a line holds of each bin."""
         statistics = bin_statistics(self.target, share)
-        sigma = residual_sigma(residual, self.target, statistics)
         measured, stiffness = self.target.stiffness, None
         if measured is not None:
             known = measured.known
             stiffness = np.stack([np.real(known.value), np.imag(known.value)]), known.stderr
-        spectrum = self.target.proportional_power, statistics.bias, statistics.sd, sigma
+        spectrum = self.target.proportional_power, statistics.bias, statistics.sd
         data = Data(*spectrum, self.variation, self.mean, stiffness)
         given = as_arrays({"data": data, "statistics": statistics})
-        return PartResiduals(
-            as_arrays(self.task), self.coordinates, model, **given, residual=residual
-        )
+        return PartResiduals(as_arrays(self.task), self.coordinates, model, **given)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,22 +176,18 @@ class FitProblem:
 
     `prior` is the precision of every θ by itself (1, or 0 where it is flat); `damping`, a row for
     each muscle whose damping ratio has a prior, too (`damping_row`). `control`: whether all tasks
-    have a linear response; `optimiser`, which makes the steps (None: Levenberg-Marquardt);
-    `draws`, which random numbers what is simulated for expectations takes.
+    have a linear response.
     """
 
     parts: tuple[Part, ...]
     coordinates: Coordinates
     prior: np.ndarray
-    residual: str
     method: str
     dt: float
     key: Any
     seeds: int
     control: bool
     tell: Callable[[str, float], None]
-    optimiser: Any = None
-    draws: Draws = Draws()  # noqa: RUF009
     damping: tuple[Float[np.ndarray, " free"], ...] = ()
 
     @property
@@ -323,15 +313,13 @@ class FitProblem:
         correction, if known."""
         none = [None] * len(self.parts)
         given = zip(self.parts, shares or none, corrections or none, strict=True)
-        return self._residuals(
-            part.linear(self.residual, share, correction) for part, share, correction in given
-        )
+        return self._residuals(part.linear(share, correction) for part, share, correction in given)
 
     def montecarlo(self, seeds: int, shares: Sequence[np.ndarray] | None = None) -> Residuals:
         """Its residuals on the first `seeds` noise paths."""
         given = zip(self.parts, shares or [None] * len(self.parts), strict=True)
         return self._residuals(
-            part.residuals(self._paths(part, seeds), self.residual, share) for part, share in given
+            part.residuals(self._paths(part, seeds), share) for part, share in given
         )
 
     def _residuals(self, parts: Any) -> Residuals:
@@ -341,26 +329,14 @@ class FitProblem:
             self.coordinates,
             **free,
             columns=tuple(part.columns for part in self.parts),
-            optimiser=self.optimiser,
         )
 
     def _paths(self, part: Part, seeds: int) -> MonteCarlo:
         settings, every = part.target.settings, self.steps_per_sample
         part.task.check_step(self.dt)
         grid = Grid(self.dt, every * round(DURATION * settings.rate), every, 1, reverse=False)
-        return MonteCarlo.of(
-            settings,
-            jax.random.fold_in(self.key, 0),
-            seeds,
-            grid,
-            part.chosen,
-            WINDOW,
-            control=self.control,
-            draws=self.draws,
-            samples=trial_samples(part.target),
-            points=part.points,
-            recorded=recorded_interval(part.target, settings),
-        )
+        key = jax.random.fold_in(self.key, 0)
+        return MonteCarlo.of(part.expected(), settings, key, seeds, grid, control=self.control)
 
     def finer(self, objective: Residuals, points: Float[np.ndarray, "points free"]) -> Residuals:
         """The residuals with as many sub-steps as the stiffest of the points asks for; never fewer

@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.types import Scalar
-from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.spectra._bin_law import BinStatistics, shares_map
+from jaxmuscle.spectra._bin_law import BinStatistics
 
 from ._coordinates import Coordinates, task_at
 from ._moment_models import Linear, MonteCarlo
@@ -29,7 +28,6 @@ class Data(eqx.Module):
     target: Float[Array | np.ndarray, "*rows bins"]
     bias: Float[Array | np.ndarray, "*rows bins"]
     sd: Float[Array | np.ndarray, "*rows bins"]
-    sigma: Float[Array | np.ndarray, "*rows bins"]
     variation: tuple[Scalar, Scalar] | None
     mean: tuple[Scalar, Scalar] | None
     stiffness: (
@@ -50,7 +48,6 @@ class Compared(eqx.Module):
     """What the residuals of one target follow from once its moments are known."""
 
     data: Data
-    residual: str = eqx.field(static=True)
 
 
 class PartResiduals(eqx.Module):
@@ -61,33 +58,16 @@ class PartResiduals(eqx.Module):
     model: Linear | MonteCarlo
     data: Data
     statistics: BinStatistics
-    residual: str = eqx.field(static=True)
 
     def moments(self, theta: Float[Array, " own"]) -> Moments:
         """Moments of the model at its own coordinates."""
         return self.model.moments(task_at(self.task, self.coordinates, theta))
 
 
-def data_residuals(residual: str, moments: Moments, data: Data) -> Float[Array, " residuals"]:
+def data_residuals(moments: Moments, data: Data) -> Float[Array, " residuals"]:
     """Residuals in standard deviations of the data: spectrum, then the further ones."""
-    return jnp.concatenate(
-        [
-            jnp.asarray(_spectrum_residuals(residual, moments, data)),
-            further_residuals(moments, data),
-        ]
-    )
-
-
-def _spectrum_residuals(
-    residual: str, moments: Moments, data: Data
-) -> Float[Array | np.ndarray, " bins"]:
-    if residual == "log":
-        z = jnp.log(data.target) - data.bias - jnp.log(moments.power)
-        return (z - jnp.mean(z)) / data.sd
-    difference = data.target - moments.proportional
-    if residual == "linear":
-        return difference / data.sigma
-    return jnp.cumsum(difference)[:-1] / data.sigma[:-1]
+    z = jnp.log(data.target) - data.bias - jnp.log(moments.power)
+    return jnp.concatenate([(z - jnp.mean(z)) / data.sd, further_residuals(moments, data)])
 
 
 def further_residuals(moments: Moments, data: Data) -> Float[Array, " rows"]:
@@ -111,8 +91,7 @@ class Residuals(eqx.Module):
     """Everything that the residuals of a fit depend on besides the free coordinates.
 
     Of one target or of several: `columns` says of every part where its own coordinates stand among
-    those of the fit. Moments and data are tuples, one entry for each part. `optimiser` makes the
-    steps that lower them (None: Levenberg-Marquardt).
+    those of the fit. Moments and data are tuples, one entry for each part.
     """
 
     parts: tuple[Any, ...]  # of `PartResiduals`; where they are `filled`, of `Compared`
@@ -120,7 +99,6 @@ class Residuals(eqx.Module):
     prior_root: Float[Array | np.ndarray, "free free"]
     moving: Float[Array | np.ndarray, " free"]
     columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    optimiser: Any = eqx.field(static=True, default=None)
 
     @property
     def linear(self) -> bool:
@@ -145,12 +123,7 @@ class Residuals(eqx.Module):
         self, moments: tuple[Moments, ...], data: tuple[Data, ...]
     ) -> Float[Array, " residuals"]:
         """Data residuals of all parts, one after the other."""
-        return jnp.concatenate(
-            [
-                data_residuals(part.residual, m, d)
-                for part, m, d in zip(self.parts, moments, data, strict=True)
-            ]
-        )
+        return jnp.concatenate([data_residuals(m, d) for m, d in zip(moments, data, strict=True)])
 
     def residuals(
         self, theta: Float[Array, " free"], moments: tuple[Moments, ...], data: tuple[Data, ...]
@@ -162,7 +135,7 @@ class Residuals(eqx.Module):
         """What residuals follow from once moments are known, with coordinates that nothing depends
         on: a program of steps that fits share, whatever their tasks and free parameters."""
         more = free_size(len(self.coordinates.names)) - len(self.coordinates.names)
-        parts = tuple(Compared(part.data, part.residual) for part in self.parts)
+        parts = tuple(Compared(part.data) for part in self.parts)
         root = np.eye(len(self.prior_root) + more, dtype=self.prior_root.dtype)
         root[: len(self.prior_root), : len(self.prior_root)] = self.prior_root
         return Residuals(
@@ -171,7 +144,6 @@ class Residuals(eqx.Module):
             root,
             np.pad(self.moving, (0, more), constant_values=1),
             columns=(),
-            optimiser=self.optimiser,
         )
 
     def own(
@@ -192,18 +164,3 @@ class Residuals(eqx.Module):
 def free_size(free: int) -> int:
     """How many coordinates a shared program has for so many."""
     return max(-(-free // 8) * 8, 16)
-
-
-def residual_sigma(
-    kind: str, target: Target, statistics: BinStatistics
-) -> Float[np.ndarray, " bins"]:
-    """What the linear and the cumulative residual are divided by: standard deviations of p_k or of
-    its running sum."""
-    p = target.proportional_power
-    if kind == "linear" and target.sigma is not None and target.segments is None:
-        return np.asarray(target.sigma)
-    spread = shares_map(p) @ statistics.covariance @ shares_map(p).T
-    if kind == "cumulative":
-        summed = np.tril(np.ones((len(p), len(p))))
-        spread = summed @ spread @ summed.T
-    return np.sqrt(np.maximum(np.diag(spread), 1e-300))

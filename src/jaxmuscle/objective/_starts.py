@@ -265,9 +265,9 @@ def _without_spectra(objective: Residuals, answers: Bool[np.ndarray, " free"]) -
 
 def _blind(data: Data) -> Data:
     """The same of a target whose spectrum does not count, nor how large the fluctuations are."""
-    sd, sigma = (np.full_like(own, UNKNOWN) for own in (data.sd, data.sigma))
+    sd = np.full_like(data.sd, UNKNOWN)
     variation = None if data.variation is None else (data.variation[0], np.asarray(UNKNOWN))
-    return dataclasses.replace(data, sd=sd, sigma=sigma, variation=variation)
+    return dataclasses.replace(data, sd=sd, variation=variation)
 
 
 def frequencies_for(problem: FitProblem, name: str, count: int) -> Float[np.ndarray, " starts"]:

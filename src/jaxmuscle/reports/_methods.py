@@ -140,7 +140,7 @@ def fit_methods(result: "FitResult") -> str | None:
         (
             f"A stochastic rheological muscle model ({result.only.model}) was fitted to"
             f" {' and '.join(fitted.rsplit(', ', 1))} {how} (Levenberg-Marquardt,"
-            f" {set_to['starts']} starts, {set_to['residual']} power weighted by its scatter, seed"
+            f" {set_to['starts']} starts, log power weighted by its scatter, seed"
             f" {result.seed}{simulated}{checked if simulated else ''})."
         ),
         *_tried(result),

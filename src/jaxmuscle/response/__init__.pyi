@@ -8,7 +8,7 @@ from ._expected_spectrum import expected_spectrum as expected_spectrum
 from ._expected_spectrum import expected_variation as expected_variation
 from ._input_response import dynamic_stiffness as dynamic_stiffness
 from ._input_response import noise_density as noise_density
-from ._linearised import Linearisation as Linearisation
+from ._linear_task import Linearisation as Linearisation
 from ._linearised import linearise as linearise
 from ._linearised import settled as settled
 from ._presets import load_preset as load_preset

@@ -17,11 +17,13 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._decimation import FINER, REACH, anti_alias
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from ._linearised import Linearisation, balanced
+from ._linear_task import Linearisation, balanced
 
-SHORT = 4
+SHORT = 4  # doublings: blocks of sixteen, about the root of the points of the low-pass
 KINK = 10  # values of r from lag 0 on that say what its kink does to a sum
-DECAY = 100.0  # 1/s, of states that nothing drives or reads
+# 1/s, of states that nothing drives or reads: they must decay, since the equation of the stationary
+# covariance has no solution where two eigenvalues cancel
+DECAY = 100.0
 
 
 class Chain(NamedTuple):
@@ -123,7 +125,9 @@ def stationary(
         matrix[..., :, None, :, None] * eye[:, None, :]
         + eye[:, None, :, None] * matrix[..., None, :, None, :]
     )
-    both = both + jnp.swapaxes(both, -1, -2)  # an entry and its mirror image are one
+    # P is symmetric: an entry and its mirror image are one unknown. So there are half as many, and
+    # to solve for them takes about an eighth of the operations.
+    both = both + jnp.swapaxes(both, -1, -2)
     both = both.reshape(*both.shape[:-4], n * n, n * n)[..., upper, :][..., upper]
     driven = (white @ jnp.swapaxes(white, -1, -2)).reshape(*matrix.shape[:-2], n * n)[..., upper]
     twice = jnp.asarray(np.where(i == j, 0.5, 1.0), matrix.dtype)
@@ -173,6 +177,7 @@ class Autocovariance(NamedTuple):
     def lagged(self, lags: int) -> Float[Array, "parts lags"]:
         """r at lags 0, Δ, 2Δ ...: from few steps to the right and few long ones to the left, which
         meet in one product."""
+        # 2^k steps on one side and 2^(n - k) on the other: fewest at k = n / 2.
         short = (lags.bit_length() + 1) // 2
         long = max((lags - 2).bit_length() - short, 0)
         columns = _further(self.powers[:short], self.next)

@@ -1,5 +1,7 @@
 """The operating point of a task: equilibrium under its held inputs, and its eigenvalues."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -156,3 +158,9 @@ def _linearisations(
     return points, jax.vmap(lambda y, t: jacobian(task, y, t))(
         points, jnp.concatenate([times[-1:], times])
     )
+
+
+def signals_of(task: AbstractTask) -> dict[str, AbstractSignal]:
+    """Every input that is a function of time."""
+    found = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
+    return {name: value for name, value in found.items() if isinstance(value, AbstractSignal)}

@@ -17,7 +17,8 @@ from jaxmuscle.spectra._settings import LONGEST, SpectrumSettings, samples_in, t
 
 from ._autocovariance import autocovariances, covariances
 from ._harmonic_line import LONG, harmonic_line, removed, transformed
-from ._linearised import Linearisation, linearise
+from ._linear_task import Linearisation
+from ._linearised import linearise
 
 TAIL = 1e-13
 ROUNDING = 1e-20  # of any unit of the output: fluctuations that are smaller are none

@@ -17,7 +17,8 @@ from jaxmuscle.spectra._welch import Spectrum
 from ._autocovariance import autocovariances
 from ._expected import Moments, log_variation_sd, low_pass_spread, response
 from ._harmonic_line import harmonic_line
-from ._linearised import Linearisation, linearise
+from ._linear_task import Linearisation
+from ._linearised import linearise
 from ._rows import Sampling, low_pass_of, moments_of_rows, variation_sd_of_numbers
 
 _response = kept(response)  # compiled apart, so that it is traced once

@@ -16,7 +16,7 @@ from jaxmuscle.spectra._decimation import FINER, anti_alias
 from jaxmuscle.spectra._settings import SpectrumSettings, tapers_of
 from jaxmuscle.spectra._welch import lowpass, spectrum_of
 
-from ._linearised import Linearisation
+from ._linear_task import Linearisation
 from ._transfer import harmonic_system, times_i, transfer, turn_of
 
 # samples of a segment: beyond, a fast Fourier transform takes the place of matrices, whose size is

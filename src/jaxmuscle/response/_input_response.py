@@ -14,17 +14,9 @@ from jaxmuscle.model._parameters import INPUTS, set_parameters
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
 
 from ._equilibrium import HOLD
-from ._linearised import (
-    Linearisation,
-    Mechanics,
-    Near,
-    check_equilibrium,
-    check_inputs,
-    in_parts,
-    linearisation,
-    linearise,
-    value_and_slopes,
-)
+from ._linear_task import Linearisation
+from ._linearised import check_equilibrium, check_inputs, linearisation, linearise
+from ._mechanics import Mechanics, Near, in_parts, value_and_slopes
 from ._transfer import SignalSystem, polynomial, polynomials, system_of, times_i
 
 AT_ONCE = 64  # frequencies of the program of `stiffness_rows`

@@ -43,15 +43,8 @@ from ._harmonic_line import (
     table_of,
 )
 from ._input_response import stiffness_rows
-from ._linearised import (
-    Linearisation,
-    LinearTask,
-    Mechanics,
-    Near,
-    Operating,
-    in_parts,
-    value_and_slopes,
-)
+from ._linear_task import Linearisation, LinearTask
+from ._mechanics import Mechanics, Near, Operating, in_parts, value_and_slopes
 from ._transfer import SignalSystem, harmonic_system, transfer
 
 MANY = 512  # points that are held at once

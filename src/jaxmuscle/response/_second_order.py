@@ -26,7 +26,8 @@ from ._equilibrium import HOLD, mechanics, without_settings
 from ._expected import Moments, covariance_operator, expected_powers, lags_of
 from ._expected_moments import expected_moments
 from ._harmonic_line import LONG
-from ._linearised import Linearisation, linearisation
+from ._linear_task import Linearisation
+from ._linearised import linearisation
 
 NOTICED = 0.1
 NEGATIVE = 0.01

@@ -12,7 +12,7 @@ from jaxmuscle.model._activation import ACTIVE
 from jaxmuscle.model._muscle import Perturbation
 from jaxmuscle.model._tasks import AbstractTask
 
-from ._linearised import Linearisation
+from ._linear_task import Linearisation
 
 POINTS = 400
 

@@ -18,7 +18,8 @@ from jaxmuscle._common.types import Key, Seed
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.response._equilibrium import fastest_rate, without_settings
-from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_inputs, linearised
+from jaxmuscle.response._linear_task import LinearTask
+from jaxmuscle.response._linearised import check_equilibrium, check_inputs, linearised
 from jaxmuscle.spectra._settings import WINDOW, Sampling, SpectrumSettings
 
 from ._batch import Recipe, run_seeds

@@ -17,8 +17,9 @@ from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedLength
-from jaxmuscle.objective._arguments import MASSES, FitOptions, planned
+from jaxmuscle.objective._arguments import MASSES, planned
 from jaxmuscle.objective._derived import TANGENTS, derived_names, has_tangents
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.response._expected_spectrum import expected_spectrum
 

@@ -26,7 +26,8 @@ from jaxmuscle.objective._starts import frequency_names
 from jaxmuscle.response._expected import Moments, noise_response, noise_variance
 from jaxmuscle.response._harmonic_line import LineTable, harmonic_size
 from jaxmuscle.response._input_response import parts_of_stiffness
-from jaxmuscle.response._linearised import Linearisation, linearise
+from jaxmuscle.response._linear_task import Linearisation
+from jaxmuscle.response._linearised import linearise
 from jaxmuscle.response._transfer import harmonic_system, polynomial, polynomials
 
 from ._frequency_grid import Band, band_about

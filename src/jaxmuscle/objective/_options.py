@@ -1,0 +1,123 @@
+"""The options of a fit, declared once: what `fit`, `fit_joint`, `fit_cohort` and `problem` take as
+keywords (their docstrings say what each does)."""
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Literal, TypedDict
+
+from jaxmuscle._common.arguments import count, positive
+from jaxmuscle._common.keys import check_key, number_of
+from jaxmuscle._common.progress import Tell, nothing
+from jaxmuscle._common.text import choices
+from jaxmuscle._common.types import Key
+from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._parameters import proper_names, proper_values
+
+from ._given import check_data, check_named
+
+METHODS = ("linear", "montecarlo")
+MOST = 10**9  # of starts, seeds and steps: what is more is a slip
+DT = 2.5e-3
+
+
+class DataOptions(TypedDict, total=False):
+    """What is fitted, and what is known of it beforehand."""
+
+    free: Iterable[str] | None
+    fix: Mapping[str, float] | None
+    noise: str | AbstractNoise | None
+    bounds: Mapping[str, tuple[float, float]] | None
+    priors: Mapping[str, float | None] | None
+    coefficient_of_variation: bool
+
+
+class SearchOptions(DataOptions, total=False):
+    """And how it is searched for."""
+
+    starts: int | None
+    max_steps: int
+    key: Key
+
+
+class SimulationOptions(SearchOptions, total=False):
+    """And what is simulated, and tried."""
+
+    seeds: int | None
+    check_seeds: int | None
+    rungs: int | None
+
+
+def check_options(caller: Callable[..., Any], known: Any, given: Mapping[str, Any]) -> None:
+    """Raise `TypeError` for a keyword of a function that is not of the `known` ones, a
+    `TypedDict`."""
+    own = [
+        p.name for p in inspect.signature(caller).parameters.values() if p.default is not p.empty
+    ]
+    for name in given:
+        if name not in known.__optional_keys__:
+            ones = choices(name, sorted([*known.__optional_keys__, *own]))
+            raise TypeError(f"{caller.__name__}() has no option {name!r}: {ones}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """How a fit is done: all that its keywords may say, checked.
+
+    `also_free`: what is free besides `free`, whatever that is; `carried`, by which number the task
+    was multiplied to come to a measured mean force.
+    """
+
+    free: Iterable[str] | None = None
+    fix: Mapping[str, float] | None = None
+    noise: str | AbstractNoise | None = None
+    method: str = "linear"
+    starts: int | None = None
+    seeds: int | None = None
+    check_seeds: int | None = None
+    key: Key = 0
+    bounds: Mapping[str, tuple[float, float]] | None = None
+    priors: Mapping[str, float | None] | None = None
+    coefficient_of_variation: bool = True
+    mean_force: tuple[float, float] | Literal[False] | None = None
+    also_free: tuple[str, ...] = ()
+    carried: float | None = None
+    max_steps: int = 40
+    dt: float = DT
+    rungs: int | None = None
+    progress: Tell = nothing
+
+    @classmethod
+    def of(
+        cls, caller: Callable[..., Any], known: type, given: Mapping[str, Any], **own: Any
+    ) -> "FitOptions":
+        """From the keywords of a function that takes the `known` ones, a `TypedDict`, and from what
+        it says itself. Raises `TypeError` for another keyword."""
+        check_options(caller, known, given)
+        return cls(**given, **own)
+
+    def __post_init__(self) -> None:
+        check_named(self.free, self.fix, self.bounds, self.priors)
+        named = {"free": proper_names(self.free)}
+        named |= {name: proper_values(getattr(self, name)) for name in ("fix", "bounds", "priors")}
+        for name, value in named.items():
+            object.__setattr__(self, name, value)
+        if self.method not in METHODS:
+            raise ValueError(f"method = {self.method!r}: {choices(self.method, METHODS)}")
+        for name, least in (
+            ("starts", 1),
+            ("seeds", 0),
+            ("check_seeds", 0),
+            ("max_steps", 1),
+            ("rungs", 0),
+        ):
+            if getattr(self, name) is not None:
+                count(name, getattr(self, name), least, MOST)
+        check_key(self.key)
+        positive("dt", self.dt)
+        check_data(self.coefficient_of_variation, self.mean_force)
+
+    @property
+    def seed(self) -> int | None:
+        """The key, if it was given as a number."""
+        return number_of(self.key)
