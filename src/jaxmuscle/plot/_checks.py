@@ -16,6 +16,7 @@ from ._style import (
     SKY,
     VERMILLION,
     AnyFigure,
+    Style,
     canvas,
     finished,
     fitted_to,
@@ -187,7 +188,7 @@ def bootstrap(found: Any, ax: Axes | None = None) -> AnyFigure:
 def _refits(ax: Axes, q: Any, label: str) -> None:
     low, high = q.true - 1.96 * q.stated, q.true + 1.96 * q.stated
     ax.axvspan(low, high, color=SKY, alpha=0.25, lw=0, zorder=0, label="stated 95 % interval")
-    style: dict[str, Any] = {"color": GREY, "zorder": 2, "label": label}
+    style: Style = {"color": GREY, "zorder": 2, "label": label}
     count = len(q.values)
     if count >= HISTOGRAM:
         ax.hist(q.values, min(BINS, 2 + count // 4), alpha=0.75, **style)

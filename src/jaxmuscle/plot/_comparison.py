@@ -12,6 +12,7 @@ from ._style import (
     PALETTE,
     PER_BIN,
     AnyFigure,
+    Style,
     finished,
     ink,
     log_axis,
@@ -22,7 +23,7 @@ from ._style import (
 )
 
 SPECTRA, ROW = 2.4, 0.24  # inches
-MARK: dict[str, Any] = {"ms": 5.5, "zorder": 3}
+MARK: Style = {"ms": 5.5, "zorder": 3}
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))
 
 
@@ -96,7 +97,7 @@ def _scores(ax: Axes, rows: list[Any], marks: list[dict[str, Any]]) -> None:
     """Held-out score minus that of the model of lowest AIC; none of a search that did not come to
     its end."""
     _rows(ax, [""] * len(rows))
-    said: dict[str, Any] = {"va": "center", "color": GREY}
+    said: Style = {"va": "center", "color": GREY}
     if rows[0].scores is None:
         ax.set(xticks=[])
         words = "no bins left out:\nno segments"

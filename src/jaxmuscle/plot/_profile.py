@@ -13,6 +13,7 @@ from ._style import (
     GREY,
     ORANGE,
     AnyFigure,
+    Style,
     axes_or_new,
     canvas,
     finished,
@@ -36,7 +37,7 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
     ax = axes_or_new(ax)
     values, rise, percent = found.values, found.rise, f"{100 * found.level:g} %"
     ax.plot(values, rise, color=BLUE, marker="o", ms=2.5, lw=1.2, label="profile")
-    style: dict[str, Any] = {"color": GREY, "lw": 0.8, "ls": (0, (4, 2))}
+    style: Style = {"color": GREY, "lw": 0.8, "ls": (0, (4, 2))}
     ax.axhline(found.threshold, label=f"{percent} threshold", **style)
     for number, (low, high) in enumerate(found.intervals):
         ends = values[0] if low is None else low, values[-1] if high is None else high

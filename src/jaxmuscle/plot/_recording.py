@@ -13,6 +13,7 @@ from ._style import (
     ORANGE,
     SKY,
     AnyFigure,
+    Style,
     canvas,
     density_unit,
     finished,
@@ -24,7 +25,7 @@ from ._style import (
 )
 
 MOST = 8  # traces of trials that are drawn
-DOTS: dict[str, Any] = {"lw": 1.0, "marker": "o", "ms": 2.8}
+DOTS: Style = {"lw": 1.0, "marker": "o", "ms": 2.8}
 
 
 @styled
@@ -48,12 +49,12 @@ def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> A
     for panel, log in zip(spectra, (False, True), strict=True):
         f, power = np.asarray(welch.frequency), np.asarray(welch.power)
         shown = positive(f, log)
-        style = {"color": GREY, "lw": 0.6, "alpha": 0.8, "zorder": 2}
+        style: Style = {"color": GREY, "lw": 0.6, "alpha": 0.8, "zorder": 2}
         panel.plot(fft.frequency, fft.power, label="FFT of the window", **style)
         if band:
             edges = (edge[shown] * np.sum(power) for edge in band)
-            style = {"color": BLUE, "alpha": 0.2, "lw": 0, "zorder": 3}
-            panel.fill_between(f[shown], *edges, label="± 1 SD", **style)
+            area: Style = {"color": BLUE, "alpha": 0.2, "lw": 0, "zorder": 3}
+            panel.fill_between(f[shown], *edges, label="± 1 SD", **area)
         panel.plot(f[shown], power[shown], color=ink(), label=label, zorder=4, **DOTS)
         _spectrum_axes(panel, welch.unit, log)
     return finished(fig, heights, recording.name)

@@ -11,6 +11,7 @@ from ._style import (
     GREY,
     PALETTE,
     PROPORTIONAL,
+    Style,
     axes_or_new,
     density_unit,
     frequency_axes,
@@ -130,7 +131,7 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
             label=label,
             zorder=1,
         )
-    style: dict[str, Any] = {"color": ink(), "lw": 0.6, "marker": "o", "ms": 2.8, "zorder": 3}
+    style: Style = {"color": ink(), "lw": 0.6, "marker": "o", "ms": 2.8, "zorder": 3}
     (line,) = ax.plot(frequency[shown], power[shown], **style)
     # neither hidden from the legend nor read as mathematics
     name = named(target.name, 40).lstrip("_").replace("$", r"\$")

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from jaxmuscle._common.text import squared
 
-from ._style import BLUE, SKY, AnyFigure, finished, log_axis, panels, styled
+from ._style import BLUE, SKY, AnyFigure, Style, finished, log_axis, panels, styled
 
 VARIATION = "coefficient_of_variation"
 VARIATIONS = {
@@ -69,7 +69,7 @@ def _dots(ax: Axes, steadiness: Any, names: dict[str, str], scale: float = 1.0) 
     at = np.arange(len(names))
     if len(trials) > 1:
         places = (at[:, None] + beside).ravel()
-        style = {"ms": 2.8, "color": SKY, "zorder": 3}
+        style: Style = {"ms": 2.8, "color": SKY, "zorder": 3}
         ax.plot(places, each.ravel(), "o", label="trials, in their order", **style)
     found = [steadiness.measures[name] for name in names.values()]
     value = scale * np.array([m.value for m in found])

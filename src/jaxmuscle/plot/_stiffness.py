@@ -9,10 +9,10 @@ from jaxtyping import Complex
 from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
-from ._style import BLUE, GREY, ORANGE, ink, legend, log_axis, shade_deviations
+from ._style import BLUE, GREY, ORANGE, Style, ink, legend, log_axis, shade_deviations
 
 Curve = tuple[str, Complex[np.ndarray, " bins"]]
-POINTS: dict[str, Any] = {"fmt": "o", "ms": 2.8, "lw": 0.8, "zorder": 3}
+POINTS: Style = {"fmt": "o", "ms": 2.8, "lw": 0.8, "zorder": 3}
 
 
 def gain(

@@ -49,12 +49,12 @@ LINE = 0.17  # inches
 ACROSS = 2  # panels in a row
 # from end to end of a logarithmic axis: of so few 1, 2 and 5 may leave one number only
 NARROW = 4.0
-SIZE = (COLUMN, 3.0)
 LOCK = threading.RLock()  # pyplot and rcParams are those of all threads
 PROPORTIONAL = "Proportional power (fraction per bin)"
 PER_BIN = "Power (fraction per bin)"  # beside others, where there is less room
 
 AnyFigure = Figure | SubFigure
+Style = dict[str, Any]  # of lines, areas and letters, for matplotlib's functions
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -224,8 +224,11 @@ def without_legend(ax: Axes) -> Axes:
     return ax
 
 
-def axes_or_new(ax: Axes | None) -> Axes:
-    return plt.subplots(figsize=SIZE, layout="constrained")[1] if ax is None else ax
+def axes_or_new(ax: Axes | None, height: float = 3.0) -> Axes:
+    """The axes, or those of a new figure of that height [inches]."""
+    if ax is not None:
+        return ax
+    return plt.subplots(figsize=(COLUMN, height), layout="constrained")[1]
 
 
 def legend(ax: Axes, place: Literal["upper right", "lower left", "above"]) -> None:

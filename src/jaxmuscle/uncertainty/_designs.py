@@ -152,10 +152,10 @@ def told_data(problem: FitProblem) -> tuple[str, str]:
     tasks, told = [], []
     for part in problem.parts:
         target, bins, data = part.target, len(part.target.bins), []
-        if bins and target.segments is None:
-            data += [f"{bins} bins with a stated sigma"]
-        elif bins:
+        if bins and target.segments is not None:
             data += [_spectrum_in_words(target.segments, target.settings)]
+        elif bins:
+            data += [f"{bins} bins with a stated sigma"]
         data += ["coefficient of variation"] * (part.variation is not None)
         data += ["mean"] * (part.mean is not None)
         if part.points is not None:
