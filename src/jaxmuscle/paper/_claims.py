@@ -45,12 +45,8 @@ def check(found: Reproduction) -> tuple[Row, ...]:
 
 def claims_json(rows: tuple[Row, ...]) -> str:
     """The table for programs."""
-    return (
-        json.dumps(
-            nulled([row._asdict() for row in rows]), indent=1, ensure_ascii=False, allow_nan=False
-        )
-        + "\n"
-    )
+    table = nulled([row._asdict() for row in rows])
+    return json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _local(spectrum, stated: float) -> tuple[float, float]:
