@@ -413,7 +413,7 @@ def test_six_and_the_same_sign_are_needed():
     assert decided(("a", "b"), Evidence(0.0, up), Evidence(6.0, down), needed=12.8).winner is None
     assert decided(("a", "b"), Evidence(0.0, None), Evidence(6.0, None)).winner == "a"
     assert decided(("a", "b"), Evidence(np.nan, up), Evidence(6.0, down)).winner is None
-    open_ = decided(("a", "b"), Evidence(0.0, up), Evidence(60.0, down, settled=False))
+    open_ = decided(("a", "b"), Evidence(0.0, up), Evidence(60.0, down, success=False))
     assert (
         open_.winner is None
         and str(open_) == "a and b are not compared: the search of b did not converge"

@@ -23,9 +23,15 @@ from jaxmuscle.objective._starts import continued, points_about, starting_points
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._bin_law import target_law
 
-SPREAD, RANDOM, PLAIN = 24, 8, 16
-BLOCK, BLOCKS, ENOUGH = 12, 20, 1e-3
-SAME, KEPT = 1e-3, 16
+SPREAD, RANDOM, PLAIN = 24, 8, 16  # starting points: over the prior, drawn, of a smooth model
+BLOCK, BLOCKS, ENOUGH = 12, 20, 1e-3  # steps at once, how often; a gain in ln L that is too small
+SAME, KEPT = 1e-3, 16  # heights that are one maximum; starts that are followed on
+
+
+Sets = Float[np.ndarray, " sets"]
+SetsFree = Float[np.ndarray, "sets free"]
+SetsBins = Float[np.ndarray, "sets bins"]
+Settled = Bool[np.ndarray, " sets"]
 
 
 class Maxima(NamedTuple):
@@ -35,19 +41,19 @@ class Maxima(NamedTuple):
     harmonic's share of the power of each bin.
     """
 
-    theta: Float[np.ndarray, "sets free"]
-    log_likelihood: Float[np.ndarray, " sets"]
-    parameters: Float[np.ndarray, " sets"]
-    proportional: Float[np.ndarray, "sets bins"]
-    line: Float[np.ndarray, "sets bins"]
-    settled: Bool[np.ndarray, " sets"]
+    theta: SetsFree
+    log_likelihood: Sets
+    parameters: Sets
+    proportional: SetsBins
+    line: SetsBins
+    settled: Settled
 
 
 class HeldOut(NamedTuple):
     """Log density of every bin given the others that were kept, by a fit to those."""
 
-    scores: Float[np.ndarray, "sets bins"]
-    settled: Bool[np.ndarray, " sets"]
+    scores: SetsBins
+    settled: Settled
 
 
 class Candidate(NamedTuple):
@@ -109,7 +115,7 @@ def maxima(
     model: Candidate,
     starts: Float[np.ndarray, "sets starts free"],
     bins: Bins | None,
-    moving: Float[np.ndarray, "sets free"],
+    moving: SetsFree,
 ) -> Maxima:
     """A block of steps from every start, then on from those that stand at different heights to the
     highest maximum."""
@@ -144,7 +150,7 @@ def _highest(
     bins: Bins | None,
     moving: np.ndarray,
     owner: Int[np.ndarray, " rows"],
-) -> tuple[Maximum, Bool[np.ndarray, " sets"]]:
+) -> tuple[Maximum, Settled]:
     """The best row of every data set, once a block of steps improves it by less than `ENOUGH`;
     whether it came to that."""
     sets, theta = len(moving), theta.copy()
@@ -177,8 +183,8 @@ def _climbed(
 def effective_numbers(
     curvature: Float[np.ndarray, "sets all all"],
     precision: Float[np.ndarray, "free free"],
-    moving: Float[np.ndarray, "sets free"],
-) -> Float[np.ndarray, " sets"]:
+    moving: SetsFree,
+) -> Sets:
     """Effective numbers of parameters over the moving coordinates; `curvature` is that of θ and the
     offset, Λ included."""
     found = []
@@ -252,9 +258,9 @@ def stacked(bins: list[Bins]) -> Bins:
 
 def held_out(
     model: Candidate,
-    theta: Float[np.ndarray, "sets free"],
+    theta: SetsFree,
     folds: Folds,
-    moving: Float[np.ndarray, "sets free"],
+    moving: SetsFree,
 ) -> HeldOut:
     """`ln f(p_k | bins kept; θ of the fold) = ln f(p_k and bins kept) - ln f(bins kept)`, refitted
     from `theta`."""

@@ -68,10 +68,10 @@ def start_values(result: Any, ax: Axes | None = None) -> Axes:
     ratio, rows = (values / values[0])[:, positive], np.arange(len(names))
     ax = axes_or_new(ax, 1.0 + 0.24 * len(names))
     norm = SymLogNorm(1.0, vmin=0.0, vmax=max(float(rise.max()), 1.0))
-    colours = plt.get_cmap("viridis")(norm(rise))
+    colours = plt.get_cmap("viridis")
     style: Style = {"marker": "o", "ms": 2.5}
     for i in range(len(ratio) - 1, 0, -1):
-        ax.plot(ratio[i], rows, lw=0.6, color=colours[i], **style)
+        ax.plot(ratio[i], rows, lw=0.6, color=colours(norm(rise[i])), **style)
     ax.plot(ratio[0], rows, lw=1.2, color=ink(), zorder=3, **style)
     ax.set_yticks(rows, names)
     ax.set_ylim(len(names) - 0.5, -0.5)
