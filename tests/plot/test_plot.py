@@ -841,7 +841,7 @@ def designed():
         for k in (1, 5, 9)
     ]
     return Fake(
-        told=told,
+        names=told,
         frequency=f,
         time=time,
         displacement=1e-3 * np.sin(time),
@@ -886,7 +886,7 @@ def identified():
         designs=designs,
         present=outlook("now", 1.0),
         together=" and ",
-        told=told,
+        names=told,
         open_in_fit=(),
         telling_pairs=[outlook(f"{names[0]} and {names[1]}", 1e9)],
         letter=lambda i: "ABC"[i],

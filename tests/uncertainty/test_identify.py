@@ -35,9 +35,9 @@ from jaxmuscle.spectra._settings import WINDOW
 from jaxmuscle.uncertainty import _identifiability
 from jaxmuscle.uncertainty._design_information import (
     design_information,
+    expansion_at,
     information_of,
-    seen_here,
-    without_further,
+    without_scalars,
 )
 
 TRUTH = jm.Isometric().replace(harmonic_amplitude=0.012, harmonic_frequency=5.0)
@@ -138,7 +138,7 @@ def same_information(found, expected):
 def test_the_information_is_that_of_log_contrasts(x64):
     problem, theta = setup_at(fitted())
     same_information(
-        information_of(problem, seen_here(problem, theta)),
+        information_of(problem, expansion_at(problem, theta)),
         proportional_information(TRUTH, (SEGMENTS,)),
     )
 
@@ -151,7 +151,7 @@ def test_a_coefficient_of_variation_adds_its_gradient(x64):
         / problem.parts[0].variation[1]
     )
     expected = proportional_information(TRUTH, (SEGMENTS,)) + np.outer(row, row)
-    same_information(information_of(problem, seen_here(problem, theta)), expected)
+    same_information(information_of(problem, expansion_at(problem, theta)), expected)
 
 
 def test_eliminating_the_offset_is_inverting_with_it():
@@ -186,7 +186,7 @@ def highest_posteriors(result, count):
     bins = (bins._replace(log_power=np.log(powers)),)
     peak = maximise(likelihood, np.tile(theta, (count, 1)), problem.precision, bins=bins)
     assert peak.settled.mean() > 0.97
-    objective = without_further(problem).linear()
+    objective = without_scalars(problem).linear()
     (values,), _ = quantities(objective, expand(objective, peak.theta))
     (truth,), (gradients,) = quantities(objective, expand(objective, theta[None]))
     return (
@@ -312,7 +312,7 @@ def test_a_design_at_other_values_knows_the_factors(x64):
 def test_separate_parameters_are_eliminated(x64):
     problem, theta = setup_at(fitted())
     task = TRUTH.replace(P_w=10.0)
-    present = information_of(problem, seen_here(problem, theta))
+    present = information_of(problem, expansion_at(problem, theta))
     tied = design_information(problem, theta, jm.Design("tied", task))
     loose = design_information(problem, theta, jm.Design("loose", task, separate=AMPLITUDES))
     own = [DEFAULT_FREE.index(n) for n in AMPLITUDES]
@@ -387,7 +387,7 @@ def test_the_usual_designs_of_a_motion(monkeypatch):
     """They follow from its moments alone: slopes are not compiled for this task."""
     monkeypatch.setattr(
         _identifiability,
-        "seen_here",
+        "expansion_at",
         lambda problem, theta: Expansion(theta, (moments_of(problem.parts[0].task),), None),
     )
     names = [design.name for design in jm.standard_designs(fitted(jm.PrescribedMotion(F_ext=8.0)))]
@@ -749,7 +749,7 @@ def test_pairs_add_up(x64):
     problem, theta = setup_at(fitted())
     designs = [jm.Design("the mean", segments=0, mean=0.02), jm.Design("longer", segments=100)]
     found = jm.identifiability(fitted(), designs=designs).pairs
-    present = information_of(problem, seen_here(problem, theta))
+    present = information_of(problem, expansion_at(problem, theta))
     both = present + sum(design_information(problem, theta, d) for d in designs)
     np.testing.assert_allclose(
         found[0].singular_values ** 2,

@@ -25,13 +25,13 @@ from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.uncertainty import Lengthening, _input_design
 from jaxmuscle.uncertainty._design_information import (
     design_information,
+    expansion_at,
     information_of,
-    opened,
-    seen_here,
+    with_open_masses,
 )
 from jaxmuscle.uncertainty._identifiability import fitted_problem
 from jaxmuscle.uncertainty._identifiability_report import TOGETHER
-from jaxmuscle.uncertainty._input_design import Experiment, _named, steps_of
+from jaxmuscle.uncertainty._input_design import Experiment, _full_name, steps_of
 
 BASE = ("k_w", "k_z", "c_w", "c_z")
 BASES, TANGENTS = ("K_w0", "K_z0", "C_w0", "C_z0"), ("K_w_tangent", "tangent_stiffness")
@@ -120,7 +120,7 @@ def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
     """By hand: H also has m_z s², and slopes by m_w; of both ln masses the prior is known, and then
     they are left out."""
     problem, theta = fitted_problem(hold(), None)
-    told, problem, theta = problem, opened(problem), np.append(theta, [0.0, 0.0])
+    told, problem, theta = problem, with_open_masses(problem), np.append(theta, [0.0, 0.0])
     lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
     moved = (
         TRUTH
@@ -153,7 +153,7 @@ def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
         found / np.outer(size, size), expected / np.outer(size, size), atol=1e-5
     )
     assert expected[1, 1] < 0.9 * whole[1, 1]  # known masses would tell more of K_z0
-    assert "m_w and m_z fitted in this measurement" in design.told(told)[1]
+    assert "m_w and m_z fitted in this measurement" in design.describe(told)[1]
 
 
 def test_two_moved_records_know_of_the_masses_once():
@@ -233,12 +233,12 @@ def test_a_mass_that_a_moved_record_was_fitted_with_is_known(x64):
         {"hold": {n: n for n in problem.coordinates.names}, "pull": {"k_w": "k_w", "m_z": "m_z"}},
     )
     assert (
-        opened(both).coordinates.names == (*both.coordinates.names, "m_z@hold")
-        and opened(other) is other
+        with_open_masses(both).coordinates.names == (*both.coordinates.names, "m_z@hold")
+        and with_open_masses(other) is other
     )
-    assert opened(problem).coordinates.names == (*problem.coordinates.names, "m_w", "m_z")
+    assert with_open_masses(problem).coordinates.names == (*problem.coordinates.names, "m_w", "m_z")
     design = jm.Design("pulled", TRUTH, segments=0, lengthening=moved, target="hold")
-    assert "(m_z fitted in this measurement)" in design.told(both)[1]
+    assert "(m_z fitted in this measurement)" in design.describe(both)[1]
 
 
 def test_what_a_record_tells_if_the_muscle_is_another_one():
@@ -502,9 +502,9 @@ def test_a_wider_band_is_told_of_where_it_tells_more():
 
 def test_a_quantity_of_several_targets_has_its_plain_name():
     known = {"K_z0": 1.0, "K_w_tangent@held": 1.0, "K_w_tangent@moved": 1.0, "model_mean@held": 1.0}
-    assert _named("K_w_tangent", known, [None, "moved", "held"]) == "K_w_tangent@moved"
-    assert _named("K_w_tangent", known, ["held", "moved"]) == "K_w_tangent@held"
-    assert [_named(n, known, [None, "moved", "held"]) for n in ("K_z0", "model_mean", "K")] == [
+    assert _full_name("K_w_tangent", known, [None, "moved", "held"]) == "K_w_tangent@moved"
+    assert _full_name("K_w_tangent", known, ["held", "moved"]) == "K_w_tangent@held"
+    assert [_full_name(n, known, [None, "moved", "held"]) for n in ("K_z0", "model_mean", "K")] == [
         "K_z0",
         "model_mean@held",
         "K",
@@ -564,7 +564,7 @@ def test_a_measured_stiffness_with_these_errors_tells_the_same(x64):
     free, found = (*DEFAULT_FREE, "P_w", "m_w", "m_z"), {}
     for given in (None, measured):
         problem, theta = fitted_problem(fitted(task, free, stiffness=given), None)
-        found[given is None] = information_of(problem, seen_here(problem, theta))
+        found[given is None] = information_of(problem, expansion_at(problem, theta))
     added = (found[False] - found[True])[:4, :4]
     expected = information(lengthening)
     size = np.sqrt(np.diag(expected))

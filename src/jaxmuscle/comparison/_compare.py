@@ -99,7 +99,7 @@ def compare_noise(  # noqa: PLR0913 (options of a public call)
     given = {"fix": fix, "priors": priors, "bounds": bounds}
     given = {argument: proper_values(values) for argument, values in given.items()}
     with told(progress, f"comparing models on {target.name}") as tell, fitting():
-        carried, left_out = _carried(task, noises, given["fix"])
+        carried, left_out = _carry(task, noises, given["fix"])
         problems = _setups(carried, target, proper_names(free), given, key)
         folds = None if target.segments is None else Folds.of([target], groups)
         found: dict[Model, dict[str, Any]] = {}
@@ -121,7 +121,7 @@ def compare_noise(  # noqa: PLR0913 (options of a public call)
     return Comparison(target, _rows(found), left_out, tasks, fitted, float(needed), groups, seed)
 
 
-def _carried(
+def _carry(
     task: AbstractTask, noises: Iterable[str], fix: dict[str, float]
 ) -> tuple[dict[str, AbstractTask], dict[str, str]]:
     """The task with each noise, or why it cannot have it."""

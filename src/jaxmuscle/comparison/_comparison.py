@@ -206,7 +206,7 @@ def lowest(rows: list[Row]) -> Row:
     return min(rows, key=lambda row: row.aic if math.isfinite(row.aic) else math.inf)
 
 
-def decided(names: tuple[str, str], a: Row, b: Row, needed: float = NEEDED) -> Decision:
+def decide(names: tuple[str, str], a: Row, b: Row, needed: float = NEEDED) -> Decision:
     """The decision between two models, called by `names`."""
     unsettled = tuple(name for name, one in zip(names, (a, b), strict=True) if not one.success)
     return Decision(*names, b.aic - a.aic, *score_difference(a.scores, b.scores), needed, unsettled)
@@ -258,7 +258,7 @@ class Comparison(Printed, Result, eqx.Module):
 
     def between(self, a: str, b: str) -> Decision:
         """Two noises, each with or without harmonic, whichever has the lower AIC."""
-        return decided((a, b), self.of(a), self.of(b))
+        return decide((a, b), self.of(a), self.of(b))
 
     @property
     def harmonic(self) -> Decision | None:
@@ -270,7 +270,7 @@ class Comparison(Printed, Result, eqx.Module):
         if not present or not absent:
             return None
         names = ("a harmonic", "no harmonic")
-        return decided(names, lowest(present), lowest(absent), self.harmonic_needed)
+        return decide(names, lowest(present), lowest(absent), self.harmonic_needed)
 
     @property
     def verdict(self) -> tuple[str, ...]:

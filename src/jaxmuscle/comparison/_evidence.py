@@ -121,7 +121,7 @@ def maxima(
     highest maximum."""
     sets, count, free = starts.shape
     owner = np.repeat(np.arange(sets), count)
-    peak = _climbed(model, starts.reshape(-1, free), bins, moving, owner)
+    peak = _climb(model, starts.reshape(-1, free), bins, moving, owner)
     on = np.concatenate(
         [s * count + _different(cost) for s, cost in enumerate(peak.cost.reshape(sets, count))]
     )
@@ -160,7 +160,7 @@ def _highest(
         rows = np.flatnonzero(~settled[owner])
         if not rows.size:
             break
-        peak = _climbed(model, theta[rows], bins, moving, owner[rows])
+        peak = _climb(model, theta[rows], bins, moving, owner[rows])
         theta[rows] = peak.theta
         reached = np.where(np.isfinite(peak.cost), peak.cost, np.inf)
         for s in np.unique(owner[rows]):
@@ -171,7 +171,7 @@ def _highest(
     return Maximum(*(np.concatenate(x) for x in zip(*best, strict=True))), settled
 
 
-def _climbed(
+def _climb(
     model: Candidate, theta: np.ndarray, bins: Bins | None, moving: np.ndarray, owner: np.ndarray
 ) -> Maximum:
     own = None if bins is None else (jax.tree.map(lambda x: np.asarray(x)[owner], bins),)
@@ -231,7 +231,7 @@ class Folds(NamedTuple):
         group = np.arange(len(targets[0].bins)) % groups
         masks = (group != np.arange(groups)[:, None]).astype(float)
         masks = np.concatenate([masks, masks[group] + np.eye(len(group))])
-        both = stacked([masked_bins(target, masks) for target in targets])
+        both = stack_bins([masked_bins(target, masks) for target in targets])
         kept, more = (
             Bins(*(x[:, part] for x in both)) for part in (slice(groups), slice(groups, None))
         )
@@ -246,12 +246,12 @@ def masked_bins(target: Target, masks: Float[np.ndarray, "rows bins"]) -> Bins:
         )
     law = target_law(target)
     power, half = np.log(target.proportional_power), law.degrees / 2
-    return stacked(
+    return stack_bins(
         [Bins(power, half, *precision_of(law.correlation, mask), mask) for mask in masks]
     )
 
 
-def stacked(bins: list[Bins]) -> Bins:
+def stack_bins(bins: list[Bins]) -> Bins:
     """Data sets along a new leading axis."""
     return jax.tree.map(lambda *x: np.stack(x), *bins)
 

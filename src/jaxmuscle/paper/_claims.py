@@ -24,7 +24,7 @@ from ._verdicts import (
     Claim,
     Numbers,
     Row,
-    checked,
+    check_claim,
     holds,
     near,
     unchecked,
@@ -40,7 +40,7 @@ STEADY, UNSTEADY = 0.013, 0.05  # coefficient of variation that people show
 
 def check(found: Reproduction) -> tuple[Row, ...]:
     """Every claim with its numbers and its verdict."""
-    return tuple(checked(claim, found) for claim in CLAIMS)
+    return tuple(check_claim(claim, found) for claim in CLAIMS)
 
 
 def claims_json(rows: tuple[Row, ...]) -> str:

@@ -86,7 +86,7 @@ def fitted(level: int) -> AbstractTask:
 
 
 @kept
-def _carried(
+def _carry(
     task: AbstractTask, fractions: Float[Array, " levels"], reference: Float[Array, ""]
 ) -> tuple[Array, Array]:
     """Power and coefficient of variation at every level."""
@@ -104,11 +104,11 @@ def levels() -> Levels:
     """The fit at 95 % at the levels of [30], 5 to 95 % MVC; and the fit at 35 %, there and at 95
     %."""
     high, low = fitted(95), fitted(35)
-    power, variation = _carried_to(high, [*LEVELS, STEADIEST], 0.95)
+    power, variation = _carry_to(high, [*LEVELS, STEADIEST], 0.95)
     entropy = [_entropies(at_level(high, fraction, reference=0.95)) for fraction in LEVELS.tolist()]
     louder = SMALLEST / variation[-1]  # to first order amplitudes and variation are proportional
     # as many levels as above, so that one program serves both
-    beside, _ = _carried_to(low, [0.35] * len(LEVELS) + [0.95], 0.35)
+    beside, _ = _carry_to(low, [0.35] * len(LEVELS) + [0.95], 0.35)
     at_35, moved = (Spectrum(low.settings.frequency, row, low.settings) for row in beside[[0, -1]])
     return Levels(
         LEVELS,
@@ -122,10 +122,10 @@ def levels() -> Levels:
     )
 
 
-def _carried_to(
+def _carry_to(
     task: AbstractTask, fractions: list[float], reference: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    found = _carried(as_arrays(task), jnp.asarray(fractions), jnp.asarray(reference))
+    found = _carry(as_arrays(task), jnp.asarray(fractions), jnp.asarray(reference))
     return np.asarray(found[0]), np.asarray(found[1])
 
 

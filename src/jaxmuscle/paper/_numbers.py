@@ -27,9 +27,9 @@ from ._readings import (
     LOW_BIN,
     SILENT,
     Reading,
-    expected,
+    expected_of,
     fast_share,
-    pulled,
+    in_task_2,
     readings,
     runs_of,
     within_bins,
@@ -121,12 +121,12 @@ class Experiment(eqx.Module):
         return tuple(spearman(a.power, b.power) for a, b in itertools.combinations(self.welch, 2))
 
 
-def tuned(task: AbstractTask) -> Tuned:
+def run_preset(task: AbstractTask) -> Tuned:
     """A preset's force in Task 1, and its displacement in Task 2 under the force that it needs
     there."""
-    moments, spectrum = expected(task)
-    runs, second = runs_of(task, SEEDS), pulled(task)
-    pulling, moved = expected(second)
+    moments, spectrum = expected_of(task)
+    runs, second = runs_of(task, SEEDS), in_task_2(task)
+    pulling, moved = expected_of(second)
     return Tuned(
         force=runs,
         spectrum=spectrum,
@@ -147,10 +147,10 @@ def concentric(task: AbstractTask) -> Concentric:
     harmonic."""
     way = SmoothStep(MOVED)
     moving = task.with_parts(x_z=way)
-    moments, spectrum = expected(moving)
+    moments, spectrum = expected_of(moving)
     found = peaks(spectrum)
     high = max(found.local_maxima, key=lambda peak: peak.power, default=found.maximum)
-    back = runs_of(pulled(moving, MOVED).replace(**SILENT), 1)
+    back = runs_of(in_task_2(moving, MOVED).replace(**SILENT), 1)
     wanted = np.asarray(jax.vmap(way)(jnp.asarray(back.time)))
     error = np.abs(np.asarray(back.output)[0] - wanted).max() / MOVED
     return Concentric(float(moments.mean), found.maximum.frequency, high.frequency, float(error))
@@ -209,7 +209,7 @@ def person(number: int) -> AbstractTask:
     return task.replace(**{n: task[n] * f for n, f in zip(PERSON, factors, strict=True)})
 
 
-def recorded(
+def record(
     task: AbstractTask, seeds: int = 1, key: int = 100, name: str = "run"
 ) -> tuple[Recording, ...]:
     """60 s of x_z [m] at 120 Hz, after a rise of 5 s, as recordings."""
@@ -224,7 +224,7 @@ def recorded(
 def simulated_recordings() -> tuple[Recording, ...]:
     """Three simulated people."""
     return tuple(
-        recorded(person(i), key=100 + i, name=f"simulated person {i + 1}")[0] for i in range(3)
+        record(person(i), key=100 + i, name=f"simulated person {i + 1}")[0] for i in range(3)
     )
 
 
@@ -275,15 +275,15 @@ class Reproduction(eqx.Module):
     readings: tuple[Reading, ...]
 
 
-def computed(
+def compute(
     given: tuple[Recording, ...] | None = None, report: Progress = lambda text, share: None
 ) -> Reproduction:
     """All numbers, in float64; nothing is written."""
     with jax.enable_x64(True):
         report("Task 1 and 2, zagrodny-slifkin", 0.0)
-        slifkin = tuned(load_preset("zagrodny-slifkin"))
+        slifkin = run_preset(load_preset("zagrodny-slifkin"))
         report("Task 1 and 2, zagrodny-hamilton", 0.15)
-        hamilton = tuned(load_preset("zagrodny-hamilton"))
+        hamilton = run_preset(load_preset("zagrodny-hamilton"))
         moving = concentric(slifkin.force.task)
         report("levels of contraction", 0.3)
         moved = levels()
@@ -291,7 +291,7 @@ def computed(
         compared = regularity(slifkin.force)
         report("three people", 0.5)
         people = experiment(given)
-        tuned_runs = experiment(recorded(slifkin.displacement.task, seeds=3))
+        tuned_runs = experiment(record(slifkin.displacement.task, seeds=3))
         report("three readings", 0.6)
         judged = readings(slifkin.force.task)
         return Reproduction(slifkin, hamilton, moving, moved, compared, people, tuned_runs, judged)

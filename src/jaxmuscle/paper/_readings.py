@@ -63,7 +63,7 @@ def runs_of(task: AbstractTask, seeds: int = SEEDS, key: int = 0, **options: Any
     return ensemble(task, jax.random.key(key), seeds=seeds, control=False, **options)
 
 
-def expected(task: AbstractTask) -> tuple[Moments, Spectrum]:
+def expected_of(task: AbstractTask) -> tuple[Moments, Spectrum]:
     """The moments of a task's output in the window, and its expected spectrum."""
     moments, _ = expected_moments(task, task.settings, WINDOW)
     power = np.asarray(moments.power)
@@ -103,7 +103,7 @@ class Reading(eqx.Module):
         return tuple(FACTS[key] for key, holds in self.facts.items() if not holds)
 
 
-def pulled(task: AbstractTask, x_z: float = HELD) -> AbstractTask:
+def in_task_2(task: AbstractTask, x_z: float = HELD) -> AbstractTask:
     """The same muscle in Task 2, constant forces from 5 s on.
 
     For Task 1 the P_w(t) that it needs, without noise and harmonic, to hold the insertion at `x_z`
@@ -134,28 +134,28 @@ def readings(preset: AbstractTask) -> tuple[Reading, ...]:
     slow, pwelch = "a transient slower than the window, mean removed", SpectrumSettings.pwelch()
     held = preset.replace(harmonic_frequency=LOW)
     return (
-        _judged("A", "a harmonic at 4.25 Hz on slow relaxation", preset),
-        _judged("B", isometric, resonant()),
-        _judged("B1", "the same in Task 1, whose one state cannot resonate", held),
+        _judge("A", "a harmonic at 4.25 Hz on slow relaxation", preset),
+        _judge("B", isometric, resonant()),
+        _judge("B1", "the same in Task 1, whose one state cannot resonate", held),
         # neither a mean that leaks nor a transient has an expected spectrum
-        _judged("C1", leaking, preset.replace(c_z=5.0), pwelch),
-        _judged("C2", slow, preset.replace(c_z=1000.0), preset.settings),
+        _judge("C1", leaking, preset.replace(c_z=5.0), pwelch),
+        _judge("C2", slow, preset.replace(c_z=1000.0), preset.settings),
     )
 
 
-def _judged(
+def _judge(
     key: str, words: str, task: AbstractTask, simulated: SpectrumSettings | None = None
 ) -> Reading:
     """By the expected spectrum, or by the mean one of 16 seeds with these settings; the time series
     from one seed."""
     runs = runs_of(task)
-    moments, spectrum = expected(task)
+    moments, spectrum = expected_of(task)
     if simulated is not None:
         moments, _ = expected_moments(task, simulated, WINDOW)
         mean = runs.spectrum(simulated).mean()
         spectrum = Spectrum(simulated.frequency, np.asarray(mean.power), simulated, mean.unit)
     sine, force = float(moments.line[0] / spectrum.power[0]), np.asarray(runs.between())[0]
-    pulling, displacement = expected(pulled(task))
+    pulling, displacement = expected_of(in_task_2(task))
     found, fast = peaks(spectrum), fast_share(force, task.settings.rate)
     oscillates = peaks(displacement).local_maxima or pulling.line[0] / pulling.power[0] >= LINE
     facts = {

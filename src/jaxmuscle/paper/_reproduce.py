@@ -8,7 +8,7 @@ import jax
 
 from jaxmuscle.data._recording import Recording
 
-from ._numbers import Reproduction, computed, given_recordings
+from ._numbers import Reproduction, compute, given_recordings
 
 
 def reproduce(
@@ -41,7 +41,7 @@ def reproduce(
 
     given = None if recordings is None else given_recordings(recordings)
     with told(progress, "reproduce") as report:
-        found = computed(given, report)
+        found = compute(given, report)
         report("figures", 0.8)
         with jax.enable_x64(True):
             draw(found, Path(out))

@@ -63,7 +63,7 @@ class Row(NamedTuple):
     why: str
 
 
-def checked(claim: Claim, found: Reproduction) -> Row:
+def check_claim(claim: Claim, found: Reproduction) -> Row:
     """A claim with its numbers and its verdict."""
     numbers = tuple(map(float, claim.numbers(found)))
     verdict = claim.rule(*numbers)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from ._style import BLUE, GREEN, GREY, VERMILLION, finished, panels, styled
+from ._style import BLUE, GREEN, GREY, VERMILLION, finish, panels, styled
 
 HEIGHTS = 1.7, 1.7  # inches
 TISSUES = (("w", BLUE, "active tissue", 3.0), ("z", VERMILLION, "passive tissue", 1.5))
@@ -37,7 +37,7 @@ def static(curves: Any, ax: Any = None) -> tuple[Axes, Axes, Axes]:
         for panel in axes:
             panel.legend(loc="best")
     else:
-        finished(figure, HEIGHTS)
+        finish(figure, HEIGHTS)
     return stiffness, damping, force
 
 

@@ -18,8 +18,8 @@ from ._style import (
     AnyFigure,
     Style,
     canvas,
-    finished,
-    fitted_to,
+    finish,
+    fit_height,
     heading,
     ink,
     key,
@@ -65,7 +65,7 @@ def goodness(found: Any, ax: Axes | None = None) -> AnyFigure:
     if len(each) > 1:
         places = fig.subfigures(len(each), 1, squeeze=False, height_ratios=heights)[:, 0]
     lines = [_goodness(*one) for one in zip(places, parts, each, strict=True)]
-    return fitted_to(fig, [height], sum(lines))
+    return fit_height(fig, [height], sum(lines))
 
 
 def _kinds(part: Any) -> tuple[bool, bool]:
@@ -182,7 +182,7 @@ def bootstrap(found: Any, ax: Axes | None = None) -> AnyFigure:
     if len(found.quantities[names[0]].values) >= HISTOGRAM:
         for panel in grid[:, 0]:
             panel.set_ylabel("Refits")
-    return finished(fig, heights, found.target)
+    return finish(fig, heights, found.target)
 
 
 def _refits(ax: Axes, q: Any, label: str) -> None:

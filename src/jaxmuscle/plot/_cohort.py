@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ._numbers import in_words
-from ._study import columns, counted, group_spectra
+from ._study import columns, group_spectra, with_count
 from ._style import (
     BLUE,
     GREY,
@@ -17,12 +17,12 @@ from ._style import (
     PER_BIN,
     AnyFigure,
     canvas,
-    fitted_to,
+    fit_height,
     frequency_axes,
     key,
-    named,
     panel_grid,
     rows_for,
+    shorten,
     styled,
 )
 
@@ -54,7 +54,7 @@ def cohort(
     """
     if by not in WAYS:
         raise ValueError(f"by = {by!r}: choose one of {', '.join(WAYS)}")
-    names = _drawn(cohort, quantities)
+    names = _rows_to_draw(cohort, quantities)
     if by == "level" and all(
         result.target.mvc_fraction is None for result in cohort.results.values()
     ):
@@ -64,7 +64,7 @@ def cohort(
     _panels(fig, cohort, names, by)
     groups = _groups(cohort)
     if len(groups) > 1 and not (by == "group" and _short(groups)):
-        fitted_to(fig, heights, key(fig, columns(groups), plain=True))
+        fit_height(fig, heights, key(fig, columns(groups), plain=True))
     return fig
 
 
@@ -81,12 +81,12 @@ def groups(
 
     **Raises:** `ValueError` if nothing is determined by half of the targets.
     """
-    names = _drawn(cohort, quantities)
+    names = _rows_to_draw(cohort, quantities)
     here: dict[str, list[Any]] = {group: [] for group in _groups(cohort)}
     for name, result in cohort.results.items():
         here[cohort.groups.get(name, "")].append(result.target)
     alike = len({tuple(target.frequency) for some in here.values() for target in some}) == 1
-    labels = [counted(group, len(targets)) for group, targets in here.items()]
+    labels = [with_count(group, len(targets)) for group, targets in here.items()]
     across = columns(labels)
     spelled = alike or not _short([*here])  # a key, below the spectra or else below all
     heights = [SPECTRA] * alike + [HEIGHT * rows_for(len(names))]
@@ -115,11 +115,11 @@ def _short(groups: list[str]) -> bool:
 
 def _below(cohort: Any) -> float:
     """How much higher [inches] long names make a panel."""
-    longest = max(len(named(name, LONGEST)) for name in cohort.results)
+    longest = max(len(shorten(name, LONGEST)) for name in cohort.results)
     return max(0.0, LETTER * (longest - FREE)) if len(cohort.results) <= LABELLED else 0.0
 
 
-def _drawn(cohort: Any, quantities: Collection[str] | None) -> list[Rows]:
+def _rows_to_draw(cohort: Any, quantities: Collection[str] | None) -> list[Rows]:
     """The rows of every quantity that at least half of the targets determine."""
     found: dict[str, Rows] = {}
     for row in cohort.table():
@@ -174,13 +174,13 @@ def _panel(ax: Axes, rows: Rows, people: list[str], groups: list[str], by: str) 
             capsize=2,
             linewidth=1,
             color=PALETTE[number % len(PALETTE)] if len(groups) > 1 else BLUE,
-            label=named(group, 2 * LONGEST) or None,
+            label=shorten(group, 2 * LONGEST) or None,
         )
     ax.set_ylabel(textwrap.fill(in_words(rows[0]["quantity"], rows[0]["unit"]), 18))
     if by == "level":
         ax.set_xlabel("Level (% MVC)")
     elif by == "group":
-        shown = [named(group, LONGEST) or "all" for group in groups] if _short(groups) else []
+        shown = [shorten(group, LONGEST) or "all" for group in groups] if _short(groups) else []
         ax.set_xticks(range(len(shown)), shown, parse_math=False)
         ax.set_xlim(-0.6, len(groups) - 0.4)
     else:
@@ -190,7 +190,7 @@ def _panel(ax: Axes, rows: Rows, people: list[str], groups: list[str], by: str) 
             return
         ax.set_xticks(
             range(len(people)),
-            [named(name, LONGEST) for name in people],
+            [shorten(name, LONGEST) for name in people],
             rotation=35 if len(people) <= 6 else 60,
             ha="right",
             rotation_mode="anchor",

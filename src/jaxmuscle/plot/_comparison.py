@@ -13,7 +13,7 @@ from ._style import (
     PER_BIN,
     AnyFigure,
     Style,
-    finished,
+    finish,
     ink,
     log_axis,
     panels,
@@ -46,7 +46,7 @@ def comparison(comparison: Any, ax: Axes | None = None) -> AnyFigure:
     _spectra(spectra, comparison, colours)
     _criterion(criterion, rows, marks)
     _scores(scores, rows, marks)
-    return finished(fig, heights, comparison.target.name)
+    return finish(fig, heights, comparison.target.name)
 
 
 def _spectra(ax: Axes, comparison: Any, colours: dict[str, str]) -> None:

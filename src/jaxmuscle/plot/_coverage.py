@@ -8,7 +8,7 @@ import numpy as np
 import scipy.stats
 from matplotlib.axes import Axes
 
-from ._style import GREY, PALETTE, canvas, finished, ink, named, shade, styled
+from ._style import GREY, PALETTE, canvas, finish, ink, shade, shorten, styled
 
 HEIGHT = 3.0  # inches
 FINE = np.linspace(0.0, 1.0, 401)
@@ -82,13 +82,13 @@ def coverage(
             # equal curves lie upon each other: the lower one has an edge
             "lw": 1.0 + 1.6 * (1 - (number + 1) / len(held)),
         }
-        label = named(name.replace("_", " "), 30)
+        label = shorten(name.replace("_", " "), 30)
         ax.step(FINE, share, where="post", zorder=3, label=label, **style)
     ax.set(xlim=(0, 1), ylim=(0, 1))
     ax.set(xlabel="Credibility α of the interval", ylabel="Share that holds the truth")
     ax.set_aspect("equal", adjustable="box")
     if own:
-        finished(ax.figure, [HEIGHT])
+        finish(ax.figure, [HEIGHT])
     else:
         ax.legend(loc="upper left")
     return ax

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from ._style import BLUE, GREY, ORANGE, AnyFigure, finished, log_axis, panels, shade, styled
+from ._style import BLUE, GREY, ORANGE, AnyFigure, finish, log_axis, panels, shade, styled
 
 SHOWN = 20.0  # s
 HEIGHTS, ROW = (1.7, 1.5), 0.2  # inches
@@ -23,7 +23,7 @@ def designed_input(found: Any, ax: Axes | None = None) -> AnyFigure:
     error that was asked for. Errors are in percent of the value, of one record. Letters are legible
     in a column of 85 mm.
     """
-    heights = *HEIGHTS, 0.75 + ROW * len(found.told)
+    heights = *HEIGHTS, 0.75 + ROW * len(found.names)
     fig, (density, motion, errors) = panels(ax, "A;B;C", heights)
     name = DESIGNED if found.moves else FLAT
     # lines of a motion, what is known with it, and how they are drawn
@@ -41,7 +41,7 @@ def designed_input(found: Any, ax: Axes | None = None) -> AnyFigure:
     )
     _errors(errors, found, [(None, found.now, ORANGE, "D", NOW), *motions])
     fig.align_ylabels([density, motion])
-    return finished(fig, heights, columns=3)
+    return finish(fig, heights, columns=3)
 
 
 def _density(ax: Axes, found: Any, motions: list[Any]) -> None:
@@ -58,7 +58,7 @@ def _density(ax: Axes, found: Any, motions: list[Any]) -> None:
 
 def _errors(ax: Axes, found: Any, ways: list[Any]) -> None:
     """A row for each quantity, a mark for each way to measure it."""
-    names = found.told
+    names = found.names
     for _, known, colour, marker, label in ways:
         size = [found.percent(name, known) for name in names]
         ax.plot(size, np.arange(len(names)), marker, ms=4.5, color=colour, label=label, zorder=3)

@@ -24,13 +24,13 @@ from ._style import (
     AnyFigure,
     Style,
     canvas,
-    finished,
+    finish,
     ink,
     log_axis,
-    named,
     output_label,
     shade,
     shade_deviations,
+    shorten,
     styled,
     without_legend,
 )
@@ -63,12 +63,12 @@ def fit(result: Any, ax: Axes | None = None) -> AnyFigure:
             panel(fig.add_subplot(grid[row, column] if len(draw) > 1 else grid[row, :]))
     # in red whatever forbids to believe the fit
     bad = "Does not describe the data" if result.adequate is False else ""
-    parts, name = result.parts.values(), named(", ".join(result.parts), 50)
+    parts, name = result.parts.values(), shorten(", ".join(result.parts), 50)
     if len(parts) == 1:
-        name = named(result.target.name, 50)
+        name = shorten(result.target.name, 50)
     if any(part.target.provenance == "reconstructed" for part in parts):
         name += " (reconstructed)"
-    return finished(fig, heights, name, bad=bad if result.success else "Not fitted")
+    return finish(fig, heights, name, bad=bad if result.success else "Not fitted")
 
 
 def _panels(result: Any) -> list[Row]:

@@ -15,7 +15,7 @@ from ._style import (
     AnyFigure,
     Style,
     canvas,
-    finished,
+    finish,
     log_axis,
     shade,
     styled,
@@ -47,14 +47,16 @@ def identifiability(report: Any, ax: Axes | None = None) -> AnyFigure:
     marks = ["now", *marks]
     labels = [_label(mark, o.name) for mark, o in zip(marks, shown, strict=True)]
     lines = sum(label.count("\n") + 1 for label in labels)
-    names = [name for name in report.told if not name.startswith("band_")]  # these are in the table
+    names = [
+        name for name in report.names if not name.startswith("band_")
+    ]  # these are in the table
     heights = [0.7 + TEXT * lines + DOTS * len(shown), 1.1 + ROW * len(names)]
     width = max(COLUMN, NAMES + CELL * len(shown))
     fig = canvas(ax, heights, width)
     upper, lower = fig.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
     _singular_values(upper.add_subplot(), shown, labels, report.threshold)
     _matrix(lower.add_subplot(), shown, marks, names, report.open_in_fit)
-    return finished(fig, heights, report.target, bad=report.doubt, columns=3, width=width)
+    return finish(fig, heights, report.target, bad=report.doubt, columns=3, width=width)
 
 
 def _label(mark: str, name: str) -> str:

@@ -14,8 +14,8 @@ from ._style import (
     VERMILLION,
     AnyFigure,
     canvas,
-    finished,
-    fitted_to,
+    finish,
+    fit_height,
     heading,
     ink,
     legend,
@@ -39,7 +39,7 @@ def frequency_response(response: Any, ax: Axes | None = None) -> AnyFigure:
     fig, axes = panels(ax, "A;B;C", heights, sharex=True)
     _response(axes, response)
     fig.align_ylabels(axes)
-    return fitted_to(fig, heights, heading(fig, response.name))
+    return fit_height(fig, heights, heading(fig, response.name))
 
 
 @styled
@@ -77,7 +77,7 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> A
     _response(panels, response, ("spring, damper, mass", line))
     upper.align_ylabels(traces)
     lower.align_ylabels(panels)
-    return finished(fig, heights, recording.name)
+    return finish(fig, heights, recording.name)
 
 
 def _response(

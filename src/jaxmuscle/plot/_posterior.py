@@ -23,7 +23,7 @@ from ._style import (
     Style,
     axes_or_new,
     canvas,
-    fitted_to,
+    fit_height,
     heading,
     log_axis,
     styled,
@@ -42,7 +42,7 @@ MASS = (0.95, 0.8, 0.5)
 REGIONS = ("#cfe6f5", SKY, BLUE)  # of this mass
 
 
-def chosen(found: Any) -> list[str]:
+def names_to_draw(found: Any) -> list[str]:
     """What a corner figure shows: the quantities that the data determine, and the harmonic's
     frequency."""
     known = [name for name in found.quantities if name in found.determined]
@@ -73,7 +73,7 @@ def posterior(found: Any, ax: Axes | None = None) -> AnyFigure:
     nothing.
     """
     _require_mixed(found)
-    names = chosen(found)[:PAIRS]
+    names = names_to_draw(found)[:PAIRS]
     if not names:
         raise ValueError(
             f"{found.title}: the data determine no quantity, so there is nothing to draw"
@@ -179,7 +179,7 @@ def predictive(found: Any, ax: Axes | None = None, target: str | None = None) ->
 def chains(found: Any, ax: Axes | None = None) -> AnyFigure:
     """Draws every chain of the posterior `found` over its draws, also of chains that did not
     mix."""
-    names = chosen(found) or list(found.samples)[:MOST]
+    names = names_to_draw(found) or list(found.samples)[:MOST]
     heights = [0.9] * len(names)
     fig = canvas(ax, heights)
     axes = fig.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
@@ -196,4 +196,4 @@ def chains(found: Any, ax: Axes | None = None) -> AnyFigure:
     axes[-1].set_xlabel("Draw")
     fig.align_ylabels()
     lines = heading(fig, found.title, bad="Not mixed" * (not found.success))
-    return fitted_to(fig, heights, lines)
+    return fit_height(fig, heights, lines)

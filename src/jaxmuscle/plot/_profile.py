@@ -16,7 +16,7 @@ from ._style import (
     Style,
     axes_or_new,
     canvas,
-    finished,
+    finish,
     log_axis,
     panel_grid,
     rows_for,
@@ -80,7 +80,7 @@ def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> AnyFigure:
     fig = canvas(ax, heights)
     for panel, found in zip(panel_grid(fig, len(profiles), across)[0], profiles, strict=True):
         without_legend(profile(found, panel)).set_title("")
-    return finished(fig, heights, profiles[0].target)
+    return finish(fig, heights, profiles[0].target)
 
 
 def _beside(inside: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from ._style import (
     Style,
     canvas,
     density_unit,
-    finished,
+    finish,
     frequency_axes,
     ink,
     panels,
@@ -57,7 +57,7 @@ def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> A
             panel.fill_between(f[shown], *edges, label="± 1 SD", **area)
         panel.plot(f[shown], power[shown], color=ink(), label=label, zorder=4, **DOTS)
         _spectrum_axes(panel, welch.unit, log)
-    return finished(fig, heights, recording.name)
+    return finish(fig, heights, recording.name)
 
 
 @styled
@@ -102,7 +102,7 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> AnyFigu
         panel.plot(mean.frequency, mean.power, color=ink(), label="mean", **DOTS)
         _spectrum_axes(panel, mean.unit, log)
     more = f", {len(shown)} shown" if len(shown) < len(trials) else ""
-    return finished(fig, heights, f"{_quantity(trials[0])} of {len(trials)} trials{more}")
+    return finish(fig, heights, f"{_quantity(trials[0])} of {len(trials)} trials{more}")
 
 
 def whole_trace(

@@ -11,7 +11,7 @@ from ._style import (
     PER_BIN,
     AnyFigure,
     axes_or_new,
-    finished,
+    finish,
     legend,
     output_label,
     panels,
@@ -82,7 +82,7 @@ def simulation(runs: Any, ax: Axes | None = None) -> AnyFigure:
         panel.set_ylabel(PER_BIN)
     count = np.size(runs.seeds)
     words = f"{type(runs.task).__name__}, {count} seed{'s' * (count > 1)}"
-    return finished(figure, heights, words)
+    return finish(figure, heights, words)
 
 
 @styled

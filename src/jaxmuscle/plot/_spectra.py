@@ -17,9 +17,9 @@ from ._style import (
     frequency_axes,
     ink,
     legend,
-    named,
     positive,
     shade,
+    shorten,
     styled,
 )
 
@@ -134,7 +134,7 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     style: Style = {"color": ink(), "lw": 0.6, "marker": "o", "ms": 2.8, "zorder": 3}
     (line,) = ax.plot(frequency[shown], power[shown], **style)
     # neither hidden from the legend nor read as mathematics
-    name = named(target.name, 40).lstrip("_").replace("$", r"\$")
+    name = shorten(target.name, 40).lstrip("_").replace("$", r"\$")
     line.set_label(f"{name} ({target.provenance})")
     if target.trial_power is not None:
         weights = np.asarray(target.segments)

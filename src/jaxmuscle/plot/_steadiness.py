@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from jaxmuscle._common.text import squared
 
-from ._style import BLUE, SKY, AnyFigure, Style, finished, log_axis, panels, styled
+from ._style import BLUE, SKY, AnyFigure, Style, finish, log_axis, panels, styled
 
 VARIATION = "coefficient_of_variation"
 VARIATIONS = {
@@ -53,7 +53,7 @@ def steadiness(steadiness: Any, ax: Axes | None = None) -> AnyFigure:
         panel.set(ylabel=ordinate, title=title, ylim=(0, None))
     count = len(steadiness.trials)
     words = f"{count} trials" if count > 1 else next(iter(steadiness.trials))
-    return finished(fig, HEIGHTS, f"Steadiness of {words}")
+    return finish(fig, HEIGHTS, f"Steadiness of {words}")
 
 
 def _range(name: str) -> str:

@@ -14,11 +14,11 @@ from ._style import (
     AnyFigure,
     canvas,
     density_unit,
-    finished,
+    finish,
     frequency_axes,
-    named,
     panel_grid,
     rows_for,
+    shorten,
     styled,
 )
 
@@ -61,7 +61,7 @@ def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> A
         ]
         for group in study.groups
     }
-    labels = [counted(group, *map(len, targets)) for group, targets in here.items()]
+    labels = [with_count(group, *map(len, targets)) for group, targets in here.items()]
     unit = next(iter(units)) or "?"
     ordinate = PER_BIN if proportional else f"Power ({density_unit(unit)})"
     for place, (panel, condition) in enumerate(zip(axes, conditions, strict=True)):
@@ -69,22 +69,22 @@ def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> A
             if targets[place]:
                 colour = PALETTE[number % len(PALETTE)]
                 group_spectra(panel, targets[place], colour, labels[number], proportional)
-        panel.set_title(named(condition, TITLE), parse_math=False)
+        panel.set_title(shorten(condition, TITLE), parse_math=False)
         frequency_axes(panel, True, ordinate)
         panel.label_outer()
         if place + across >= len(conditions):  # nothing stands below
             panel.set_xlabel("Frequency (Hz)")
             panel.tick_params(axis="x", which="both", labelbottom=True)
-    return finished(fig, heights, columns=columns(labels), plain=True)
+    return finish(fig, heights, columns=columns(labels), plain=True)
 
 
-def counted(group: str, *numbers: int) -> str:
+def with_count(group: str, *numbers: int) -> str:
     """A group and how many people it has, of conditions with different numbers the range."""
     low, high = min(filter(None, numbers), default=0), max(numbers)
     people = (
         "1 person" if high == 1 else f"{high} people" if low == high else f"{low} to {high} people"
     )
-    return f"{named(group, LONGEST)} ({people})" if group else people
+    return f"{shorten(group, LONGEST)} ({people})" if group else people
 
 
 def columns(labels: list[str]) -> int:

@@ -135,7 +135,7 @@ def rows_for(count: int, across: int = ACROSS) -> int:
     return -(-count // across)
 
 
-def finished(
+def finish(
     fig: AnyFigure,
     heights: Iterable[float],
     title: str | None = None,
@@ -148,10 +148,10 @@ def finished(
     """The figure with its heading and its key; one of its own becomes as high as its panels and
     these words need."""
     lines = 0 if title is None else heading(fig, title, bad=bad)
-    return fitted_to(fig, heights, lines + key(fig, columns, plain=plain), width)
+    return fit_height(fig, heights, lines + key(fig, columns, plain=plain), width)
 
 
-def fitted_to(
+def fit_height(
     fig: AnyFigure, heights: Iterable[float], lines: int, width: float = COLUMN
 ) -> AnyFigure:
     """A figure of its own becomes as high as its panels and so many lines of words need."""
@@ -172,7 +172,7 @@ def density_unit(unit: str) -> str:
     return f"{unit}²/Hz" if unit.isalpha() else f"({unit.replace('^2', '²')})²/Hz"
 
 
-def named(name: str, most: int) -> str:
+def shorten(name: str, most: int) -> str:
     """A name from a file as it is drawn: in one line, and cut where it is long."""
     shown = printable(name)
     return shown if len(shown) <= most else f"{shown[: most - 1]}…"
@@ -180,7 +180,7 @@ def named(name: str, most: int) -> str:
 
 def heading(fig: AnyFigure, words: str, *, bad: str = "") -> int:
     """What is drawn, and below it in red what forbids to believe it; how many lines."""
-    text = "\n".join(filter(None, (named(words, 50), bad)))
+    text = "\n".join(filter(None, (shorten(words, 50), bad)))
     color = VERMILLION if bad else ink()
     fig.suptitle(text, x=0.02, ha="left", size=9, weight="bold", color=color, parse_math=False)
     return 1 + bool(bad)

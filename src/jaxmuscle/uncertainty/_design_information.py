@@ -25,15 +25,15 @@ Theta = Float[np.ndarray, " free"]
 Square = Float[np.ndarray, "free free"]
 
 
-def without_further(problem: FitProblem) -> FitProblem:
+def without_scalars(problem: FitProblem) -> FitProblem:
     """The problem without coefficients of variation and means as data."""
     parts = tuple(dataclasses.replace(part, variation=None, mean=None) for part in problem.parts)
     return dataclasses.replace(problem, parts=parts)
 
 
-def seen_here(problem: FitProblem, theta: Theta) -> Expansion:
+def expansion_at(problem: FitProblem, theta: Theta) -> Expansion:
     """What the model gives at θ, and its slopes."""
-    return expand(without_further(problem).linear(), theta[None]).row(0)
+    return expand(without_scalars(problem).linear(), theta[None]).row(0)
 
 
 def information_of(problem: FitProblem, seen: Expansion) -> Square:
@@ -41,7 +41,7 @@ def information_of(problem: FitProblem, seen: Expansion) -> Square:
     return without_offsets(np.asarray(Likelihood.of(problem).information(seen)), len(seen.theta))
 
 
-def opened(problem: FitProblem) -> FitProblem:
+def with_open_masses(problem: FitProblem) -> FitProblem:
     """The problem with the `open_masses` free, too, after all else and with their usual prior: θ =
     0 are those of the tasks.
 
@@ -119,7 +119,7 @@ def design_information(problem: FitProblem, theta: Theta, design: Design) -> Squ
         prior=problem.prior[own],
         damping=tuple(row[own] for row in problem.damping),
     )
-    seen = seen_here(here, theta[own])
+    seen = expansion_at(here, theta[own])
     with_data = _with_data(local, design, seen.moments[0])
     likelihood = Likelihood.of(dataclasses.replace(here, parts=(with_data,)))
     (bins,) = likelihood.bins

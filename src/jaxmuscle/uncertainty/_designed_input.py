@@ -262,7 +262,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         )
 
     @property
-    def told(self) -> list[str]:
+    def names(self) -> list[str]:
         """The quantities to be told of: those of the muscle, and what it was made for."""
         of_muscle = [n for n in self.values if n.partition("@")[0] in OF_MUSCLE]
         return list(dict.fromkeys([*self.quantity, *of_muscle]))
@@ -446,7 +446,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         columns = {"prior": self.prior, "now": self.now, "flat": self.stderr}
         if self.moves:
             columns |= {"flat": self.flat, "designed": self.stderr}
-        loose = any(self.percent(n, self.stderr) > 100 * LOOSE for n in self.told)
+        loose = any(self.percent(n, self.stderr) > 100 * LOOSE for n in self.names)
         return [WORDS["errors"], *self._rows(columns), *[WORDS["open"]] * loose]
 
     def _rows(self, columns: dict[str, Errors]) -> list[str]:
@@ -455,7 +455,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         return [heads] + [
             NAME.format(n)
             + "".join(f"{_digits(self.percent(n, errors)):>10}" for errors in columns.values())
-            for n in self.told
+            for n in self.names
         ]
 
     def _wider(self) -> list[str]:

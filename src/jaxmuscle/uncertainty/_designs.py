@@ -110,7 +110,7 @@ class Design(eqx.Module):
         """Whether a motor moves the insertion."""
         return self.lengthening is not None
 
-    def told(self, problem: FitProblem) -> tuple[str, str]:
+    def describe(self, problem: FitProblem) -> tuple[str, str]:
         """For the package itself:
 
         task and data in words. What the design leaves open is taken from the `problem` of a fit.
@@ -147,7 +147,7 @@ class Design(eqx.Module):
         return problem.parts[0 if self.target is None else names.index(self.target)]
 
 
-def told_data(problem: FitProblem) -> tuple[str, str]:
+def describe_data(problem: FitProblem) -> tuple[str, str]:
     """Tasks and data of a fit in words."""
     tasks, told = [], []
     for part in problem.parts:

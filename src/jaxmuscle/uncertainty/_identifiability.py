@@ -25,12 +25,12 @@ from ._design_information import (
     Square,
     Theta,
     design_information,
+    expansion_at,
     information_of,
-    opened,
-    seen_here,
-    without_further,
+    with_open_masses,
+    without_scalars,
 )
-from ._designs import Design, designs_for, told_data, without_noise
+from ._designs import Design, describe_data, designs_for, without_noise
 from ._identifiability_report import (
     NO_NOISE,
     TOGETHER,
@@ -82,21 +82,21 @@ def identifiability(
             if tried is None
             else any(design.moves for design in tried)
         )
-        problem = opened(fitted) if moves else fitted
+        problem = with_open_masses(fitted) if moves else fitted
         theta = np.append(at, np.zeros(len(problem.prior) - len(at)))
-        seen = seen_here(problem, theta)
+        seen = expansion_at(problem, theta)
         tried = designs_for(fitted, seen) if tried is None else tried
         names = [design.name for design in tried]
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"designs: two are called {name!r}: rename one")
         here = Here.of(problem, seen, result.derived_names, len(at))
-        added = [_added(problem, theta, design) for design in tried]
-    task, data = told_data(fitted)
+        added = [_information_in(problem, theta, design) for design in tried]
+    task, data = describe_data(fitted)
     present = here.outlook(0.0, name="the present data", task=task, data=data)
     alone = []
     for design, (more, failed) in zip(tried, added, strict=True):
-        task, data = design.told(fitted)
+        task, data = design.describe(fitted)
         about = {"task": task, "data": data, "separate": design.separate, "failed": failed}
         alone += [here.outlook(more, present, design.moves, name=design.name, **about)]
     possible = [(d, x) for d, (x, failed) in zip(tried, added, strict=True) if failed is None]
@@ -117,14 +117,14 @@ def identifiability(
         present,
         tuple(alone),
         tuple(pairs),
-        (missed(result) if target is None else ()) + notices,
+        (misfit_notices(result) if target is None else ()) + notices,
         result.derived[MEAN].value if result.per_newton else None,
         tuple(n for n, p in found.items() if n in known and p.stderr is None),
         {n: float(first[n]) for n in MASSES if n in first.parameter_names and n not in names},
     )
 
 
-def missed(result: FitResult) -> tuple[str, ...]:
+def misfit_notices(result: FitResult) -> tuple[str, ...]:
     """What has to be said before a plan that stands on a fit whose model misses the data."""
     found = result.adequacy
     if found is None or found.adequate:
@@ -150,7 +150,7 @@ def standard_designs(result: FitResult, target: Target | None = None) -> tuple[D
     """
     with fitting():
         problem, theta = fitted_problem(result, target)
-        return designs_for(problem, seen_here(problem, theta))
+        return designs_for(problem, expansion_at(problem, theta))
 
 
 def fitted_problem(result: FitResult, target: Target | None) -> tuple[FitProblem, Theta]:
@@ -163,7 +163,7 @@ def fitted_problem(result: FitResult, target: Target | None) -> tuple[FitProblem
     return dataclasses.replace(problem, parts=tuple(parts)), problem.theta_of(tasks)
 
 
-def _added(problem: FitProblem, theta: Theta, design: Design) -> tuple[Square, str | None]:
+def _information_in(problem: FitProblem, theta: Theta, design: Design) -> tuple[Square, str | None]:
     """What a design tells, or why it is impossible."""
     try:
         return design_information(problem, theta, design), None
@@ -175,7 +175,7 @@ class Here(NamedTuple):
     """The fit: information of its data, its prior, values and gradients of what can be known.
 
     The first `free` of the coordinates are those that the fit has free; the others are masses, see
-    `opened`.
+    `with_open_masses`.
     """
 
     coordinates: Coordinates
@@ -195,7 +195,7 @@ class Here(NamedTuple):
         values = {n: (float(v), unit_of(n)) for n, v in zip(c.names, natural, strict=True)}
         gradients = dict(zip(c.names, np.diag(c.slope(natural)), strict=True))
         rows = jax.tree.map(lambda x: np.asarray(x)[None], seen)
-        tables = quantities(without_further(problem).linear(), rows)
+        tables = quantities(without_scalars(problem).linear(), rows)
         free = len(c.names) if free is None else free
         for name in derived:
             part, quantity = problem.where(name)

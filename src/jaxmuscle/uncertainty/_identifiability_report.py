@@ -144,7 +144,7 @@ class Outlook(Printed, Result, eqx.Module):
     def __str__(self) -> str:
         if self.failed is not None:
             return f"{self.name} is impossible: {self.failed}"
-        gained = [name for name in told(self.quantities) if name in self.gained]
+        gained = [name for name in names_to_show(self.quantities) if name in self.gained]
         gained.sort(key=lambda name: self.quantities[name].left)
         if not gained:
             return f"{self.name} would determine no further quantity"
@@ -203,9 +203,9 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
         return "The fit does not describe its data" * undescribed
 
     @property
-    def told(self) -> list[str]:
+    def names(self) -> list[str]:
         """Names of the quantities that tables and figures show."""
-        return told(self.present.quantities)
+        return names_to_show(self.present.quantities)
 
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings."""
@@ -249,7 +249,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
         return "\n".join([*_present(self), *_next(self), *_table(self), *_details(self)])
 
 
-def told(quantities: dict[str, Known]) -> list[str]:
+def names_to_show(quantities: dict[str, Known]) -> list[str]:
     """The quantities to be told of: K_j0 and C_j0 stand for the k_j and c_j to which they are
     proportional.
 
@@ -300,7 +300,7 @@ def _present(report: IdentifiabilityReport) -> list[str]:
             for name, error in now.products.items()
         )
         lines += _item(WORDS["products"].format(products=products))
-    if doubted := [name for name in told(now.quantities) if name in report.open_in_fit]:
+    if doubted := [name for name in names_to_show(now.quantities) if name in report.open_in_fit]:
         lines += _item(WORDS["doubted"].format(names=", ".join(doubted)))
     if now.undetermined:
         lines += ["  the data leave open:"]
@@ -374,14 +374,14 @@ def _table(report: IdentifiabilityReport) -> list[str]:
         masses = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
         opened = WORDS["opened"] * any(FITTED_TOO in outlook.data for outlook in report.designs)
         lines += _item(WORDS["masses"].format(masses=masses, opened=opened))
-    wide = max(24, *(1 + len(name) for name in report.told))
+    wide = max(24, *(1 + len(name) for name in report.names))
     # two more stand before them
     across = min(COLUMNS, (WIDTH - wide - 17) // CELL - 2)
     for start in range(0, max(len(possible), 1), across):
         block = possible[start : start + across]
         heads = ["prior", "now", *(label for label, _ in block)]
         rows = [["", "value", "unit", *heads]]
-        for name in report.told:
+        for name in report.names:
             now = report.present.quantities[name]
             value, unit = _stated(now, None if name == MEAN else report.mean_force)
             sure = now.determined and name not in report.open_in_fit

@@ -27,12 +27,12 @@ from ._design_information import (
     Theta,
     coordinates_of,
     design_information,
-    opened,
-    seen_here,
+    expansion_at,
+    with_open_masses,
 )
 from ._designed_input import DOUBTFUL, DesignedInput
 from ._designs import moved_insertion, without_noise
-from ._identifiability import LEAST_PRIOR, Here, fitted_problem, missed
+from ._identifiability import LEAST_PRIOR, Here, fitted_problem, misfit_notices
 from ._identifiability_report import BASE, NO_NOISE
 from ._lengthening import Largest, Lengthening, Lines, Samples, lines_in, require_positive
 from ._multisine import multisine, speed_of
@@ -140,7 +140,7 @@ def design_input(  # noqa: PLR0913 (options of a public call)
     crest = np.array(CREST)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_of(key))).tolist())
 
-    def realised(power: Lines) -> tuple[Samples, Largest]:
+    def realise(power: Lines) -> tuple[Samples, Largest]:
         """A motion of these lines, made smaller where it must be, and the crest factors of it and
         its derivatives."""
         motion = multisine(frequency * seconds, power, seconds, samples, limits, rng)
@@ -152,16 +152,16 @@ def design_input(  # noqa: PLR0913 (options of a public call)
     with jax.enable_x64(True):
         even = Lengthening.flat(rms, band, seconds)
         experiment = Experiment.of(result, quantities, even, target)
-        motion = realised(even.power)[0]
+        motion = realise(even.power)[0]
         even = even.of_motion(motion)
         # What limits a motion are its peaks, which follow from its density: both in turn.
         for _ in range(TRIES if np.isfinite(min(limits)) else 1):
             allowed = np.minimum(limits / crest, [rms, np.inf, np.inf])
-            motion, crest = realised(experiment.best(allowed, spread))
+            motion, crest = realise(experiment.best(allowed, spread))
         own, wider = even.of_motion(motion), None
         if 4 * band[1] < rate:
             wide = Lengthening.flat(rms, (band[0], 2 * band[1]), seconds).within(limits / crest)
-            wider = 2.0 * band[1], experiment.errors(wide.power, lines=experiment.informed(wide))
+            wider = 2.0 * band[1], experiment.errors(wide.power, lines=experiment.by_line(wide))
         now, known = experiment.errors(None), experiment.here.values
         others = {
             n: tuple(
@@ -187,7 +187,7 @@ def design_input(  # noqa: PLR0913 (options of a public call)
         needed=None
         if error is None
         else (float(error), seconds * experiment.times_for(own.power, error)),
-        notices=missed(result) if isinstance(result, FitResult) else (),
+        notices=misfit_notices(result) if isinstance(result, FitResult) else (),
         elsewhere=others,
         masses=experiment.masses,
         held=experiment.held,
@@ -211,7 +211,7 @@ def _samples(seconds: float, rate: float) -> int:
     return samples
 
 
-def _named(name: str, known: Mapping[str, Any], targets: Iterable[str | None]) -> str:
+def _full_name(name: str, known: Mapping[str, Any], targets: Iterable[str | None]) -> str:
     """A quantity by the name that it has in a fit of several targets, of the first that has it:
     "K_w_tangent@moved"."""
     return next(
@@ -248,7 +248,7 @@ class Experiment(NamedTuple):
     start: Square
     apart: Square
     frequency: Lines
-    informed: Callable[[Lengthening], Float[np.ndarray, "lines free free"]]
+    by_line: Callable[[Lengthening], Float[np.ndarray, "lines free free"]]
     lines: Float[np.ndarray, "lines free free"]
     moved: bool
 
@@ -266,8 +266,8 @@ class Experiment(NamedTuple):
         fitted, theta, derived = _problem(given)
         if without_noise(fitted):
             raise ValueError(f"result: {NO_NOISE}")
-        fitted = dataclasses.replace(fitted, parts=tuple(map(_as_moved, fitted.parts)))
-        problem = opened(fitted)
+        fitted = dataclasses.replace(fitted, parts=tuple(map(_held_by_motor, fitted.parts)))
+        problem = with_open_masses(fitted)
         theta = np.append(theta, np.zeros(len(problem.prior) - len(theta)))
         if step is not None:
             theta = theta + step
@@ -276,10 +276,10 @@ class Experiment(NamedTuple):
         tangents = problem.by_name(
             [dict.fromkeys(TANGENTS if has_tangents(part.task) else ()) for part in problem.parts]
         )
-        here = Here.of(problem, seen_here(problem, theta), dict.fromkeys([*derived, *tangents]))
+        here = Here.of(problem, expansion_at(problem, theta), dict.fromkeys([*derived, *tangents]))
         moved = [part.name for part in fitted.parts if part.target.stiffness is not None]
         targets = [target, *moved, *(part.name for part in fitted.parts)]
-        quantity = tuple(_named(name, here.gradients, targets) for name in quantity)
+        quantity = tuple(_full_name(name, here.gradients, targets) for name in quantity)
         for name in quantity:
             if name not in here.gradients:
                 raise ValueError(f"quantity {name!r}{_unknown(name, problem, here)}")
@@ -287,14 +287,14 @@ class Experiment(NamedTuple):
             record, problem.parts[0].target.settings, coefficient_of_variation=True, target=target
         )
         like = design.like(problem)
-        task: Any = _moved(like.task).with_parts(settings=like.target.settings)
+        task: Any = _with_motor(like.task).with_parts(settings=like.target.settings)
         # a response tells how the muscle is damped, so the ratio needs no prior of its own
         prior = problem.prior
         start = np.diag(prior) + (here.information if isinstance(given, FitResult) else 0.0)
         still = dataclasses.replace(design, task=task, lengthening=None)
         own, coordinates = coordinates_of(like, theta, task)
 
-        def informed(record: Lengthening) -> np.ndarray:
+        def by_line(record: Lengthening) -> np.ndarray:
             lines = np.zeros((len(record.frequency), *start.shape))
             lines[:, own[:, None], own] = record.by_line(task, coordinates, theta[own])
             return lines
@@ -310,8 +310,8 @@ class Experiment(NamedTuple):
             start,
             start + design_information(problem, theta, still),
             record.frequency,
-            informed,
-            informed(record),
+            by_line,
+            by_line(record),
             bool(moved),
         )
 
@@ -434,14 +434,14 @@ def steps_of(frequency: Lines) -> Float[np.ndarray, "steps lines"]:
     return (step == np.arange(len(starts))[:, None]) / counts[:, None]
 
 
-def _as_moved(part: Part) -> Part:
+def _held_by_motor(part: Part) -> Part:
     """A part whose insertion is held as one in which a motor holds it: its stiffness as stretched
     there can be asked for."""
     held = isinstance(part.task, Isometric)
-    return dataclasses.replace(part, task=_moved(part.task)) if held else part
+    return dataclasses.replace(part, task=_with_motor(part.task)) if held else part
 
 
-def _moved(task: Any) -> AbstractTask:
+def _with_motor(task: Any) -> AbstractTask:
     """The experiment with the muscle of a task, at the same P_w and x_z."""
     if type(task) is PrescribedLength:
         return task
@@ -456,7 +456,7 @@ def _problem(
     derived."""
     if isinstance(given, FitResult):
         return *fitted_problem(given, None), given.derived_names
-    task = as_numbers(_moved(given))
+    task = as_numbers(_with_motor(given))
     power = np.asarray(expected_spectrum(task).proportional)
     target = Target(type(task).__name__, power, segments=1, settings=task.settings)
     problem = planned(task, target, FitOptions(coefficient_of_variation=False)).problem

@@ -137,17 +137,17 @@ class PosteriorDensity(eqx.Module):
     def split(self, white: Sampled) -> tuple[Free, Offsets]:
         """Unbounded coordinates (with the point's own where not sampled) and the offsets of
         whitened ones."""
-        return self.placed(self.centre + self.scale @ white)[:2]
+        return self.place(self.centre + self.scale @ white)[:2]
 
-    def placed(self, both: Float[Numbers, " sampled"]) -> tuple[Free, Offsets, Systems]:
+    def place(self, both: Float[Numbers, " sampled"]) -> tuple[Free, Offsets, Systems]:
         """The same of sampled coordinates, with the linearised tasks as far as they were needed."""
         s = jnp.asarray(self.point).at[jnp.asarray(self.columns)].set(both[: len(self.columns)])
         offsets = jnp.zeros(len(self.likelihood.bins))
         offsets = offsets.at[jnp.asarray(self.offsets, dtype=int)].set(both[len(self.columns) :])
-        s, systems = self.levelled(s)
+        s, systems = self.from_levels(s)
         return s, offsets, systems
 
-    def levelled(self, s: Free) -> tuple[Free, Systems]:
+    def from_levels(self, s: Free) -> tuple[Free, Systems]:
         """Coordinates s of which some are counted from a level, as they are."""
         systems: Systems = {}
         for level in self.levels:
@@ -227,7 +227,7 @@ class PosteriorDensity(eqx.Module):
 
     def log_density(self, white: Sampled) -> Scalar:
         """The density; minus infinity where a task has no stable equilibrium."""
-        s, offsets, systems = self.placed(self.centre + self.scale @ white)
+        s, offsets, systems = self.place(self.centre + self.scale @ white)
         found = self.log_prior(s)
         for band in self.bands:
             found += jax.nn.logsumexp(self.heights(band, s, offsets, systems))
@@ -241,7 +241,7 @@ class PosteriorDensity(eqx.Module):
 
     def at_frequencies(self, white: Sampled) -> tuple[Heights, ...]:
         """Log density at every frequency of each band (up to a constant), given the rest."""
-        s, offsets, systems = self.placed(self.centre + self.scale @ white)
+        s, offsets, systems = self.place(self.centre + self.scale @ white)
         return tuple(self.heights(band, s, offsets, systems) for band in self.bands)
 
 
@@ -309,7 +309,7 @@ def _levels(problem: FitProblem, made: PosteriorDensity, offsets: np.ndarray) ->
 @kept
 def _levelling(made: PosteriorDensity, s: Numbers) -> Array:
     """How coordinates change with those that are counted from levels."""
-    return jax.jacfwd(lambda s: made.levelled(s)[0])(jnp.asarray(s))
+    return jax.jacfwd(lambda s: made.from_levels(s)[0])(jnp.asarray(s))
 
 
 @kept

@@ -144,7 +144,7 @@ class Posterior(Shown, eqx.Module):
             rows[name] = {**spread, "median": middle, "low": low, "high": high}
             rows[name] |= dict(zip(MIXING, self.diagnostics[name], strict=True))
             rows[name] |= {"unit": self.unit(name), "determined": name in self.determined}
-        return Summary(rows, self._told())
+        return Summary(rows, self._text())
 
     def unit(self, name: str) -> str:
         """Unit of a parameter or derived quantity."""
@@ -273,10 +273,10 @@ class Posterior(Shown, eqx.Module):
         return plot.predictive(self, ax, target)
 
     def _card(self) -> Card:
-        text = self._told()
+        text = self._text()
         return self.summary()._card()._replace(text=text) if self.success else Card(text)
 
-    def _told(self) -> str:
+    def _text(self) -> str:
         """The posterior in a few lines."""
         count, draws = self.chains.log_density.shape
         lines = [
