@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
 from jaxmuscle.comparison import _compare, _evidence
-from jaxmuscle.comparison._comparison import COLUMNS, Evidence
+from jaxmuscle.comparison._comparison import COLUMNS, Evidence, decide
 from jaxmuscle.comparison._evidence import Candidate, Folds, effective_numbers, without_harmonic
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.objective._arguments import FitOptions, planned
