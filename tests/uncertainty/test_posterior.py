@@ -341,7 +341,7 @@ def test_the_common_scale_is_counted_from_the_coefficient_of_variation():
         np.testing.assert_allclose(np.diff(ours), np.diff(theirs), atol=1e-6)
 
         def variation(s):
-            return density.log_variation(density.levelled(s)[0], 0, level.weight)[0]
+            return density.log_variation(density.from_levels(s)[0], 0, level.weight)[0]
 
         places = np.tile(np.asarray(density.point), (2, 1))
         places[1, level.column] += 0.1

@@ -336,7 +336,8 @@ class Experiment(NamedTuple):
         ]
 
         def height(share: np.ndarray) -> tuple[float, np.ndarray]:
-            """Logarithm of the sum of the variances, and its slopes."""
+            """Logarithm of the sum of the variances, and its slopes: what is stiff or soft differs
+            by its factor alone, so that one tolerance of the search serves all."""
             reached = np.linalg.solve(self.apart + np.tensordot(share, each, 1), self.rows.T)
             variances = np.sum(self.rows.T * reached)
             slopes = np.einsum("iq,kij,jq->k", reached, each, reached)
