@@ -14,8 +14,15 @@ import numpy as np
 from run import machine, write
 
 import jaxmuscle as jm
-from jaxmuscle.comparison._comparison import NEEDED, Evidence, decided, lowest
-from jaxmuscle.comparison._evidence import Candidate, Folds, held_out, masked_bins, maxima, stacked
+from jaxmuscle.comparison._comparison import NEEDED, Evidence, decide, lowest
+from jaxmuscle.comparison._evidence import (
+    Candidate,
+    Folds,
+    held_out,
+    masked_bins,
+    maxima,
+    stack_bins,
+)
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._arguments import planned
@@ -93,7 +100,7 @@ def examined(
     ]
     folds, whole = (
         Folds.of(targets, GROUPS),
-        stacked([masked_bins(t, np.ones((1, len(t.bins)))) for t in targets]),
+        stack_bins([masked_bins(t, np.ones((1, len(t.bins)))) for t in targets]),
     )
     whole = jax.tree.map(lambda x: x[:, 0], whole)
     found: list[dict[str, Any]] = [{} for _ in recordings]
@@ -169,7 +176,7 @@ def verdicts(done: dict[str, Any]) -> list[dict[str, Any]]:
         for true in (a, b):
             count = {"right": 0, "wrong": 0, "open": 0}
             for found in _of(done, harmonic, side, true):
-                winner = decided(
+                winner = decide(
                     (a, b), *(lowest([_evidence(one) for one in found[c].values()]) for c in (a, b))
                 ).winner
                 count["open" if winner is None else "right" if winner == true else "wrong"] += 1
@@ -189,7 +196,7 @@ def harmonics(done: dict[str, Any]) -> list[dict[str, Any]]:
                     lowest([_evidence(found[c][str(h)]) for c in COLOURS]) for h in (True, False)
                 ]
                 needed = NEEDED + 2 * charged * float(np.log(np.size(both[0].scores)))
-                count[decided(("shown", "denied"), *both, needed).winner or "open"] += 1
+                count[decide(("shown", "denied"), *both, needed).winner or "open"] += 1
             rows.append(
                 _case(harmonic, side) | {"needed": "6 + 2 ln(bins)" if charged else "6"} | count
             )

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
 from jaxmuscle.comparison import _compare, _evidence
-from jaxmuscle.comparison._comparison import COLUMNS, Evidence, decided
+from jaxmuscle.comparison._comparison import COLUMNS, Evidence, decide
 from jaxmuscle.comparison._evidence import Candidate, Folds, effective_numbers, without_harmonic
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.objective._arguments import planned
@@ -84,6 +84,10 @@ def compared(colour, seed, harmonic, segments=SEGMENTS):
     return compare(
         jm.Isometric(), target_of(task, seed, segments), noises=COLOURS, free=FREE, groups=GROUPS
     )
+
+
+def row_of(found, noise, harmonic):
+    return next(row for row in found.rows if (row.noise, row.harmonic) == (noise, harmonic))
 
 
 # --- what it decides
@@ -171,7 +175,7 @@ def test_likelihood_and_criterion_against_another_way(x64):
     found = compare(
         jm.Isometric(), target, noises=("band-limited", "pink"), free=FREE, groups=GROUPS
     )
-    row = next(r for r in found.rows if (r.noise, r.harmonic) == ("band-limited", False))
+    row = row_of(found, "band-limited", False)
     fitted = found.tasks["band-limited", False]
     names, h = ("c_w", "noise_K_z"), 1e-3
 
@@ -182,20 +186,11 @@ def test_likelihood_and_criterion_against_another_way(x64):
         return float(log_likelihood(moved, target))
 
     assert row.log_likelihood == pytest.approx(at(0.0, 0.0), abs=1e-6)
-    hessian = np.array(
-        [
-            [
-                -sum(
-                    a * b * at(*(h * (a * np.eye(2)[i] + b * np.eye(2)[j])))
-                    for a in (1, -1)
-                    for b in (1, -1)
-                )
-                / (4 * h**2)
-                for j in range(2)
-            ]
-            for i in range(2)
-        ]
-    )
+    steps = h * np.eye(2)
+    corners = [(a, b) for a in (1, -1) for b in (1, -1)]
+    hessian = -np.array(
+        [[sum(a * b * at(*(a * x + b * y)) for a, b in corners) for y in steps] for x in steps]
+    ) / (4 * h**2)
     direct = np.trace(hessian @ np.linalg.inv(hessian + np.eye(2)))
     # The information takes the bins' covariance for that of normal logarithms: off by the order
     # 1/ν, here a thousandth.
@@ -277,7 +272,7 @@ def test_a_bin_that_was_left_out_against_a_fit_by_scipy(x64):
     )
     more = jax.tree.map(jnp.asarray, measured_bins(target, kept + np.eye(30)[k]))
     power = moments(task_at(best.x))
-    score = next(r for r in found.rows if (r.noise, r.harmonic) == ("pink", False)).scores[k]
+    score = row_of(found, "pink", False).scores[k]
     # Both stop within 1e-3 of the maximum: θ within √0.002 of a standard deviation, and so the
     # score within 0.05. The fit to all bins foretells this one better by 1.5.
     assert score == pytest.approx(marginal(more, power) - marginal(bins, power), abs=0.05)
@@ -378,7 +373,7 @@ def made(*, disagree=False, sigma=False, success=True, p=0.2):
 
 def test_differences_and_weights():
     found = made()
-    by = {(row.noise, row.harmonic): row for row in found.rows}
+    flat, best = row_of(found, "band-limited", False), row_of(found, "pink", True)
     assert (
         found.best.noise == "pink"
         and found.best.harmonic
@@ -389,11 +384,11 @@ def test_differences_and_weights():
     np.testing.assert_allclose(
         [row.weight for row in found.rows], np.exp(-delta / 2) / np.exp(-delta / 2).sum()
     )
-    difference = by["band-limited", False].scores - by["pink", True].scores
-    assert by["band-limited", False].score_difference == pytest.approx(difference.sum())
+    difference = flat.scores - best.scores
+    assert flat.score_difference == pytest.approx(difference.sum())
     # The standard error of a sum of 30 is 30 times that of their mean.
-    assert by["band-limited", False].score_stderr == pytest.approx(30 * scipy.stats.sem(difference))
-    assert by["pink", True].score_difference == 0.0 == by["pink", True].score_stderr
+    assert flat.score_stderr == pytest.approx(30 * scipy.stats.sem(difference))
+    assert best.score_difference == 0.0 == best.score_stderr
 
 
 @pytest.mark.parametrize("sigma", [False, True])
@@ -405,20 +400,27 @@ def test_the_table_as_a_frame(sigma):
     assert table["score"].dtype == float and bool(table["score"].isna().all()) == sigma
 
 
-def test_six_and_the_same_sign_are_needed():
-    up, down = np.full(5, 0.1), np.zeros(5)
-    assert decided(("a", "b"), Evidence(0.0, up), Evidence(6.0, down)).winner == "a"
-    assert decided(("a", "b"), Evidence(6.0, down), Evidence(0.0, up)).winner == "b"
-    assert decided(("a", "b"), Evidence(0.0, up), Evidence(5.99, down)).winner is None
-    assert decided(("a", "b"), Evidence(0.0, down), Evidence(6.0, up)).winner is None
-    assert decided(("a", "b"), Evidence(0.0, up), Evidence(6.0, down), needed=12.8).winner is None
-    assert decided(("a", "b"), Evidence(0.0, None), Evidence(6.0, None)).winner == "a"
-    assert decided(("a", "b"), Evidence(np.nan, up), Evidence(6.0, down)).winner is None
-    open_ = decided(("a", "b"), Evidence(0.0, up), Evidence(60.0, down, settled=False))
-    assert (
-        open_.winner is None
-        and str(open_) == "a and b are not compared: the search of b did not converge"
-    )
+UP, DOWN = np.full(5, 0.1), np.zeros(5)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "needed", "winner"),
+    [
+        ((0.0, UP), (6.0, DOWN), 6.0, "a"),
+        ((6.0, DOWN), (0.0, UP), 6.0, "b"),
+        ((0.0, UP), (5.99, DOWN), 6.0, None),
+        ((0.0, DOWN), (6.0, UP), 6.0, None),
+        ((0.0, UP), (6.0, DOWN), 12.8, None),
+        ((0.0, None), (6.0, None), 6.0, "a"),
+        ((np.nan, UP), (6.0, DOWN), 6.0, None),
+        ((0.0, UP), (60.0, DOWN, False), 6.0, None),
+    ],
+)
+def test_six_and_the_same_sign_are_needed(a, b, needed, winner):
+    found = decide(("a", "b"), Evidence(*a), Evidence(*b), needed)
+    assert found.winner == winner
+    unsettled = "a and b are not compared: the search of b did not converge"
+    assert (str(found) == unsettled) == (len(b) == 3)
 
 
 def test_verdict_in_words():
@@ -512,7 +514,7 @@ def test_tables_files_and_figure(sigma, tmp_path):
 
 
 def test_what_a_task_cannot_carry_is_left_out_with_its_own_reason():
-    carried, left_out = _compare._carried(jm.Isometric(), ("white", *COLOURS), {})
+    carried, left_out = _compare._carry(jm.Isometric(), ("white", *COLOURS), {})
     assert tuple(carried) == COLOURS
     with pytest.raises(ValueError) as own:
         with_noise(jm.Isometric(), "white")
@@ -520,11 +522,11 @@ def test_what_a_task_cannot_carry_is_left_out_with_its_own_reason():
         left_out == {"white": str(own.value)}
         and "where white noise has no value" in left_out["white"]
     )
-    carried, left_out = _compare._carried(
+    carried, left_out = _compare._carry(
         jm.Isometric(), ("white", *COLOURS), {"noise_K_z": 0.0, "noise_C_z": 0.0}
     )
     assert tuple(carried) == ("white", *COLOURS) and left_out == {}
-    carried, left_out = _compare._carried(
+    carried, left_out = _compare._carry(
         jm.on_rung(jm.Isometric(), 1), ("band-limited", "pink", "resonance"), {}
     )
     assert (
@@ -532,7 +534,7 @@ def test_what_a_task_cannot_carry_is_left_out_with_its_own_reason():
         and "has an activation or a resonance already" in left_out["resonance"]
     )
     mine = jm.Isometric(noise=jm.BandLimitedNoise(cutoff=20.0))
-    assert float(_compare._carried(mine, COLOURS, {})[0]["band-limited"]["noise_cutoff"]) == 20.0
+    assert float(_compare._carry(mine, COLOURS, {})[0]["band-limited"]["noise_cutoff"]) == 20.0
 
 
 FORCE = "fdi-abduction-45mvc"

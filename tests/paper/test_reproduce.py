@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands.reproduce import reproduce as command
 from jaxmuscle.data._recording import Recording
-from jaxmuscle.paper import _levels, _numbers, _readings
+from jaxmuscle.paper import _readings
 from jaxmuscle.paper._claims import CLAIMS, check
 from jaxmuscle.paper._figures import FIGURES
 from jaxmuscle.paper._levels import Levels, fitted
@@ -134,8 +134,8 @@ def done(tmp_path_factory, pytestconfig):
     plugins = pytestconfig.pluginmanager.get_plugins()
     (conftest,) = [plugin for plugin in plugins if hasattr(plugin, "DRAWN_WHOLE")]
     with pytest.MonkeyPatch.context() as patch:
-        for module in (_levels, _numbers, _readings):
-            patch.setattr(module, "ensemble", functools.partial(module.ensemble, chunk=8))
+        chunked = functools.partial(_readings.ensemble, chunk=8)
+        patch.setattr(_readings, "ensemble", chunked)
         patch.setattr(conftest, "DRAWN_WHOLE", 0)  # each is drawn as a PDF, too
         return reproduce(folder), folder
 

@@ -35,9 +35,9 @@ from jaxmuscle.spectra._settings import WINDOW
 from jaxmuscle.uncertainty import _identifiability
 from jaxmuscle.uncertainty._design_information import (
     design_information,
+    expansion_at,
     information_of,
-    seen_here,
-    without_further,
+    without_scalars,
 )
 
 TRUTH = jm.Isometric().replace(harmonic_amplitude=0.012, harmonic_frequency=5.0)
@@ -48,6 +48,7 @@ MOVED = [
     "60 s with the insertion moved by 0.1 mm rms to 10 Hz",
     "60 s with the insertion moved by 1 mm rms to 5 Hz",
 ]
+BASES = ("K_w0", "K_z0", "C_w0", "C_z0")
 AMPLITUDES = ("noise_K_w", "noise_K_z", "harmonic_amplitude")
 # Central differences with this step of a logarithm: truncation and rounding leave five digits of a
 # slope.
@@ -60,7 +61,7 @@ def fitted(
 ) -> jm.fits.FitResult:
     """What a fit would give that found `task`, its target being the expected spectrum; nothing is
     fitted."""
-    power = np.asarray(jm.expected_spectrum(task).proportional)
+    power = spectrum_of(task)
     quantity = "displacement" if task.output_unit == "m" else "force"
     made = jm.Target(
         "made",
@@ -81,6 +82,15 @@ def fitted(
     return made_result(
         task=task, target=made, fitted=power, settings=table | (settings or {}), notices=()
     )
+
+
+def in_a_line(text):
+    """What is printed, whatever its lines."""
+    return " ".join(str(text).split())
+
+
+def spectrum_of(task):
+    return np.asarray(jm.expected_spectrum(task).proportional)
 
 
 def moments_of(task):
@@ -123,11 +133,11 @@ def setup_at(result, target=None):
     return dataclasses.replace(problem, parts=(fitted_part,)), problem.theta_of((result.task,))
 
 
-def same_information(found, expected):
+def same_information(found, expected, digits=DIGITS):
     """Equal to the digits of a difference, relative to the roots of the diagonal."""
     size = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
-        found / np.outer(size, size), expected / np.outer(size, size), atol=DIGITS
+        found / np.outer(size, size), expected / np.outer(size, size), atol=digits
     )
 
 
@@ -137,7 +147,7 @@ def same_information(found, expected):
 def test_the_information_is_that_of_log_contrasts(x64):
     problem, theta = setup_at(fitted())
     same_information(
-        information_of(problem, seen_here(problem, theta)),
+        information_of(problem, expansion_at(problem, theta)),
         proportional_information(TRUTH, (SEGMENTS,)),
     )
 
@@ -150,7 +160,7 @@ def test_a_coefficient_of_variation_adds_its_gradient(x64):
         / problem.parts[0].variation[1]
     )
     expected = proportional_information(TRUTH, (SEGMENTS,)) + np.outer(row, row)
-    same_information(information_of(problem, seen_here(problem, theta)), expected)
+    same_information(information_of(problem, expansion_at(problem, theta)), expected)
 
 
 def test_eliminating_the_offset_is_inverting_with_it():
@@ -185,7 +195,7 @@ def highest_posteriors(result, count):
     bins = (bins._replace(log_power=np.log(powers)),)
     peak = maximise(likelihood, np.tile(theta, (count, 1)), problem.precision, bins=bins)
     assert peak.settled.mean() > 0.97
-    objective = without_further(problem).linear()
+    objective = without_scalars(problem).linear()
     (values,), _ = quantities(objective, expand(objective, peak.theta))
     (truth,), (gradients,) = quantities(objective, expand(objective, theta[None]))
     return (
@@ -311,7 +321,7 @@ def test_a_design_at_other_values_knows_the_factors(x64):
 def test_separate_parameters_are_eliminated(x64):
     problem, theta = setup_at(fitted())
     task = TRUTH.replace(P_w=10.0)
-    present = information_of(problem, seen_here(problem, theta))
+    present = information_of(problem, expansion_at(problem, theta))
     tied = design_information(problem, theta, jm.Design("tied", task))
     loose = design_information(problem, theta, jm.Design("loose", task, separate=AMPLITUDES))
     own = [DEFAULT_FREE.index(n) for n in AMPLITUDES]
@@ -339,44 +349,31 @@ def test_the_load_keeps_the_operating_point(x64):
         assert float(design.task[name]) == float(TRUTH[name])
 
 
+LONGER = "a recording 10 times as long"
+HELD = ["the displacement under a load of 2.18 N", *MOVED, *LEVELS, LONGER]
+VARIATION = "the coefficient of variation"
+
+
 @pytest.mark.parametrize(
-    ("result", "names"),
+    ("given", "names"),
     [
+        ({}, [VARIATION, "the mean force, known to 2 %", *HELD]),
+        ({"coefficient_of_variation": 0.016, "settings": {"mean_force": [2.18, 0.05]}}, HELD),
         (
-            lambda: fitted(),
+            {"task": jm.PrescribedForce(F_ext=1.0)},
             [
-                "the coefficient of variation",
-                "the mean force, known to 2 %",
-                "the displacement under a load of 2.18 N",
-                *MOVED,
-                *LEVELS,
-                "a recording 10 times as long",
-            ],
-        ),
-        (
-            lambda: fitted(coefficient_of_variation=0.016, settings={"mean_force": [2.18, 0.05]}),
-            [
-                "the displacement under a load of 2.18 N",
-                *MOVED,
-                *LEVELS,
-                "a recording 10 times as long",
-            ],
-        ),
-        (
-            lambda: fitted(jm.PrescribedForce(F_ext=1.0)),
-            [
-                "the coefficient of variation",
+                VARIATION,
                 "the mean displacement, known to 2 %",
                 "the force with the insertion held",
                 *LEVELS,
-                "a recording 10 times as long",
+                LONGER,
             ],
         ),
     ],
     ids=["isometric", "all numbers known", "force"],
 )
-def test_the_usual_designs(result, names):
-    designs = jm.standard_designs(result())
+def test_the_usual_designs(given, names):
+    designs = jm.standard_designs(fitted(**given))
     assert [design.name for design in designs] == names
     for design in designs:
         assert (design.separate == AMPLITUDES) is design.name.startswith("a second force level")
@@ -386,16 +383,11 @@ def test_the_usual_designs_of_a_motion(monkeypatch):
     """They follow from its moments alone: slopes are not compiled for this task."""
     monkeypatch.setattr(
         _identifiability,
-        "seen_here",
+        "expansion_at",
         lambda problem, theta: Expansion(theta, (moments_of(problem.parts[0].task),), None),
     )
     names = [design.name for design in jm.standard_designs(fitted(jm.PrescribedMotion(F_ext=8.0)))]
-    assert names == [
-        "the coefficient of variation",
-        "the mean force, known to 2 %",
-        *LEVELS,
-        "a recording 10 times as long",
-    ]
+    assert names == [VARIATION, "the mean force, known to 2 %", *LEVELS, LONGER]
 
 
 def test_no_design_is_above_the_maximal_force():
@@ -438,7 +430,7 @@ def test_the_report_agrees_with_itself():
         max((d.determined, len(d.gained)) for d in each) for each in (found.designs, found.pairs)
     )
     single = f"If you make only one: {'ABCDEFG'[np.argmax([d.determined for d in found.designs])]}"
-    assert (single in " ".join(str(found).split())) is (together > alone)
+    assert (single in in_a_line(found)) is (together > alone)
 
 
 def test_what_is_proportional_is_known_alike():
@@ -455,7 +447,7 @@ def test_the_report_in_words():
     assert lines[0] == "what the data of made determine"
     displacement = report().designs[1]
     percent = displacement.quantities["K_w0"].percent
-    said = " ".join(text.split())
+    said = in_a_line(text)
     assert (
         "the displacement under a load of 2.18 N would determine" in said
         and f"K_w0 to {percent}" in said
@@ -492,7 +484,7 @@ def test_the_report_names_what_it_knows_and_the_fit_does_not():
     assert "harmonic_share" in found.open_in_fit and not {"corner_frequency", "K_w0"} & set(
         found.open_in_fit
     )
-    said = " ".join(str(found).split())
+    said = in_a_line(found)
     assert (
         f"known here, but not determined in the fit: {', '.join(found.open_in_fit)}. The fit is"
         " stricter" in said
@@ -529,7 +521,7 @@ def test_a_report_about_a_fit_that_misses_its_data_says_so_first():
         missing.adequacy.widening == 2.0
         and f"(chi2 {4 * kept.expected:.3g}, expected" in found.notices[0]
     )
-    said = " ".join(str(found).split())
+    said = in_a_line(found)
     assert "note: the fit does not describe its data" in said and "by a factor of 2" in said
     assert found.to_dict()["notices"][0] == found.notices[0]
     for about in (
@@ -539,7 +531,7 @@ def test_a_report_about_a_fit_that_misses_its_data_says_so_first():
         assert "does not describe" not in str(about)
     motion = jm.design_input(missing, seconds=10.0, band=(0.5, 5.0), rate=50.0)
     assert motion.notices == found.notices[:1] == tuple(motion.to_dict()["notices"])
-    assert "note: the fit does not describe its data" in " ".join(str(motion).split())
+    assert "note: the fit does not describe its data" in in_a_line(motion)
 
 
 def test_the_numbers_in_the_table_are_those_of_the_report():
@@ -562,7 +554,7 @@ def test_without_newtons_values_are_stated_per_newton_as_in_the_fit():
     assert (stiffness.unit, mean.unit) == ("N/m", "N")
     # three digits
     assert float(rows["K_w0"][1]) == pytest.approx(stiffness.value / mean.value, rel=5e-3)
-    assert rows["K_w0"][2] == "1/m" and "per newton of mean force" in " ".join(str(found).split())
+    assert rows["K_w0"][2] == "1/m" and "per newton of mean force" in in_a_line(found)
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -575,7 +567,7 @@ def test_of_designs_that_determine_as_much_the_one_with_smaller_errors_is_named(
     short, long = found.designs[::order]
     assert (short.determined, len(short.gained)) == (long.determined, len(long.gained))
     letter = "AB"[found.designs.index(long)]
-    assert f"most would be learnt from {letter}, 240 s:" in " ".join(str(found).split())
+    assert f"most would be learnt from {letter}, 240 s:" in in_a_line(found)
 
 
 def test_the_report_as_json(tmp_path):
@@ -618,13 +610,13 @@ def test_a_design_without_equilibrium_is_impossible_and_the_rest_goes_on():
     )
     assert found.designs[0].failed is not None and "undamped" in found.designs[0].failed
     assert found.designs[0].quantities["k_w"].stderr == found.present.quantities["k_w"].stderr
-    assert not found.pairs and "undamped is impossible" in " ".join(str(found).split())
+    assert not found.pairs and "undamped is impossible" in in_a_line(found)
     figure = found.plot()
     plt.close(figure)
 
 
 def test_a_target_with_a_sigma_only():
-    power = np.asarray(jm.expected_spectrum(TRUTH).proportional)
+    power = spectrum_of(TRUTH)
     nu = jm.SpectrumSettings().degrees_of_freedom(SEGMENTS)
     found = jm.identifiability(fitted(segments=None, sigma=power * np.sqrt(2 / nu)))
     # Without correlation of the bins they tell more.
@@ -680,18 +672,23 @@ def test_bad_arguments(make, message):
 # --- promises
 
 
+@functools.cache
+def displaced():
+    """The design of a displacement: its task, and what it promises."""
+    promised = next(d for d in jm.identifiability(fitted()).designs if "displacement" in d.name)
+    return next(d.task for d in jm.standard_designs(fitted()) if d.name == promised.name), promised
+
+
 def test_a_design_keeps_its_promise(x64):
     """Force and displacement drawn and fitted together 200 times: the spread is the report's
     prediction."""
-    result, count = fitted(), 200
-    promised = next(d for d in jm.identifiability(result).designs if "displacement" in d.name)
-    assert {"K_w0", "K_z0", "C_w0", "C_z0"} <= set(promised.gained)
-    held = next(d.task for d in jm.standard_designs(result) if "displacement" in d.name)
+    (held, promised), count = displaced(), 200
+    assert set(BASES) <= set(promised.gained)
     tasks = {"force": TRUTH, "displacement": held}
     targets = {
         name: jm.Target(
             name,
-            np.asarray(jm.expected_spectrum(task).proportional),
+            spectrum_of(task),
             segments=SEGMENTS,
             quantity=name,
         )
@@ -728,16 +725,11 @@ def test_a_design_keeps_its_promise(x64):
 
 
 def test_a_joint_fit_reports_the_promised_errors():
-    result = fitted()
-    promised = next(d for d in jm.identifiability(result).designs if "displacement" in d.name)
-    held = next(d.task for d in jm.standard_designs(result) if "displacement" in d.name)
-    power = np.asarray(jm.expected_spectrum(held).proportional)
-    targets = {
-        "force": result.target,
-        "displacement": jm.Target("x", power, segments=SEGMENTS, quantity="displacement"),
-    }
+    held, promised = displaced()
+    moved = jm.Target("x", spectrum_of(held), segments=SEGMENTS, quantity="displacement")
+    targets = {"force": fitted().target, "displacement": moved}
     joint = jm.fit_joint(targets, tasks={"force": TRUTH, "displacement": held}, starts=4, seeds=0)
-    for name in ("K_w0", "K_z0", "C_w0", "C_z0"):
+    for name in BASES:
         assert joint.derived[name].stderr == pytest.approx(
             promised.quantities[name].stderr, rel=0.1
         )
@@ -748,7 +740,7 @@ def test_pairs_add_up(x64):
     problem, theta = setup_at(fitted())
     designs = [jm.Design("the mean", segments=0, mean=0.02), jm.Design("longer", segments=100)]
     found = jm.identifiability(fitted(), designs=designs).pairs
-    present = information_of(problem, seen_here(problem, theta))
+    present = information_of(problem, expansion_at(problem, theta))
     both = present + sum(design_information(problem, theta, d) for d in designs)
     np.testing.assert_allclose(
         found[0].singular_values ** 2,

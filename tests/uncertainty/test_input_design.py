@@ -13,7 +13,7 @@ import pages
 import pytest
 import scipy.optimize
 import scipy.stats
-from test_identify import MOVED, SEGMENTS, STEP, TRUTH, fitted
+from test_identify import BASES, MOVED, SEGMENTS, STEP, TRUTH, fitted, in_a_line, same_information
 from test_identify import slopes as by_differences
 
 import jaxmuscle as jm
@@ -25,17 +25,19 @@ from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.uncertainty import Lengthening, _input_design
 from jaxmuscle.uncertainty._design_information import (
     design_information,
+    expansion_at,
     information_of,
-    opened,
-    seen_here,
+    with_open_masses,
 )
 from jaxmuscle.uncertainty._identifiability import fitted_problem
 from jaxmuscle.uncertainty._identifiability_report import TOGETHER
-from jaxmuscle.uncertainty._input_design import Experiment, _named, steps_of
+from jaxmuscle.uncertainty._input_design import Experiment, _full_name, steps_of
 
 BASE = ("k_w", "k_z", "c_w", "c_z")
-BASES, TANGENTS = ("K_w0", "K_z0", "C_w0", "C_z0"), ("K_w_tangent", "tangent_stiffness")
+TANGENTS = ("K_w_tangent", "tangent_stiffness")
 SECONDS, BAND = 60.0, (0.1, 5.0)
+PULLED = TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
+FLAT = Lengthening.flat(1e-3, BAND, SECONDS)
 REPEATS, DOUBTFUL = 300, 1e-4  # chance of a test to fail by scatter alone
 
 
@@ -105,29 +107,19 @@ def information(lengthening):
 
 
 def test_the_information_is_that_of_the_closed_form(x64):
-    lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
-    assert len(lengthening.frequency) == 295 and lengthening.rms == pytest.approx(1e-3, rel=1e-12)
+    assert len(FLAT.frequency) == 295 and FLAT.rms == pytest.approx(1e-3, rel=1e-12)
     coordinates = Coordinates.of({n: VALUES[n] for n in BASE}, {}, dict.fromkeys(BASE, 1.0))
-    expected = information(lengthening)
-    size = np.sqrt(np.diag(expected))
-    found = lengthening.information(TRUTH, coordinates, np.zeros(4))
-    np.testing.assert_allclose(
-        found / np.outer(size, size), expected / np.outer(size, size), atol=1e-6
-    )
+    found = FLAT.information(TRUTH, coordinates, np.zeros(4))
+    same_information(found, information(FLAT), 1e-6)
 
 
 def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
     """By hand: H also has m_z s², and slopes by m_w; of both ln masses the prior is known, and then
     they are left out."""
     problem, theta = fitted_problem(hold(), None)
-    told, problem, theta = problem, opened(problem), np.append(theta, [0.0, 0.0])
-    lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
-    moved = (
-        TRUTH
-        if isinstance(TRUTH, jm.PrescribedLength)
-        else TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
-    )
-    design = jm.Design("moved", moved, segments=0, lengthening=lengthening)
+    told, problem, theta = problem, with_open_masses(problem), np.append(theta, [0.0, 0.0])
+    lengthening = FLAT
+    design = jm.Design("moved", PULLED, segments=0, lengthening=FLAT)
     found = design_information(problem, theta, design)
     f = lengthening.frequency
     up, down = (
@@ -153,13 +145,13 @@ def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
         found / np.outer(size, size), expected / np.outer(size, size), atol=1e-5
     )
     assert expected[1, 1] < 0.9 * whole[1, 1]  # known masses would tell more of K_z0
-    assert "m_w and m_z fitted in this measurement" in design.told(told)[1]
+    assert "m_w and m_z fitted in this measurement" in design.describe(told)[1]
 
 
 def test_two_moved_records_know_of_the_masses_once():
     """A record twice is one of twice the mean square: the prior of the masses counts once in
     both."""
-    once = Lengthening.flat(1e-3, BAND, SECONDS)
+    once = FLAT
     twice = Lengthening(once.frequency, 2 * once.power, SECONDS)
     moved = {
         name: jm.Design(name, TRUTH, segments=0, lengthening=given)
@@ -199,7 +191,7 @@ def test_what_follows_from_the_spectrum_depends_on_the_masses_too(x64):
 def test_a_motion_for_the_stiffness_as_stretched_in_the_hold(x64):
     """It can be asked for although the fit of a hold does not state it; value and slopes by
     hand."""
-    made = Experiment.of(hold(), ("K_w_tangent",), Lengthening.flat(1e-3, BAND, SECONDS), None)
+    made = Experiment.of(hold(), ("K_w_tangent",), FLAT, None)
 
     def tangent(p):
         return p["k_w"] * (p["x_ref_w"] ** 2 + 3 * point(p) ** 2)
@@ -214,7 +206,7 @@ def test_a_motion_for_the_stiffness_as_stretched_in_the_hold(x64):
         )
     rest = made.here.values["tangent_stiffness"][0]
     assert rest == pytest.approx(stiffness(VALUES, np.array([1e-6]))[0].real, rel=1e-6)
-    errors = made.errors(Lengthening.flat(1e-3, BAND, SECONDS).power)
+    errors = made.errors(FLAT.power)
     relative = {n: errors[n] / made.here.values[n][0] for n in ("K_w_tangent", "K_w0")}
     assert relative["K_w_tangent"] < relative["K_w0"]  # K_w0 also needs the stretch
 
@@ -222,7 +214,7 @@ def test_a_motion_for_the_stiffness_as_stretched_in_the_hold(x64):
 def test_a_mass_that_a_moved_record_was_fitted_with_is_known(x64):
     """The hold of a joint fit: m_w stays as it was fixed in both. The hold has m_z fixed for
     itself, so that is open."""
-    moved = Lengthening.flat(1e-3, BAND, SECONDS)
+    moved = FLAT
     measured = FrequencyResponse(
         moved.frequency, stiffness(VALUES, moved.frequency), np.full(len(moved.frequency), 10.0)
     )
@@ -233,22 +225,18 @@ def test_a_mass_that_a_moved_record_was_fitted_with_is_known(x64):
         {"hold": {n: n for n in problem.coordinates.names}, "pull": {"k_w": "k_w", "m_z": "m_z"}},
     )
     assert (
-        opened(both).coordinates.names == (*both.coordinates.names, "m_z@hold")
-        and opened(other) is other
+        with_open_masses(both).coordinates.names == (*both.coordinates.names, "m_z@hold")
+        and with_open_masses(other) is other
     )
-    assert opened(problem).coordinates.names == (*problem.coordinates.names, "m_w", "m_z")
+    assert with_open_masses(problem).coordinates.names == (*problem.coordinates.names, "m_w", "m_z")
     design = jm.Design("pulled", TRUTH, segments=0, lengthening=moved, target="hold")
-    assert "(m_z fitted in this measurement)" in design.told(both)[1]
+    assert "(m_z fitted in this measurement)" in design.describe(both)[1]
 
 
 def test_what_a_record_tells_if_the_muscle_is_another_one():
     """The prior of a task is independent of all else: a standard error up multiplies k_w by exp of
     its prior's, no more."""
-    task = (
-        TRUTH
-        if isinstance(TRUTH, jm.PrescribedLength)
-        else TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
-    )
+    task = PULLED
     given = {"seconds": SECONDS, "band": BAND, "rate": 50.0}
     made = jm.design_input(task, "K_w0", **given)
     factor = np.exp(made.now["K_w0"] / made.values["K_w0"])
@@ -260,9 +248,7 @@ def test_what_a_record_tells_if_the_muscle_is_another_one():
         with jax.enable_x64(True):
             known = Experiment.of(other, ("K_w0",), made.even, None).errors(made.lengthening.power)
         assert error == pytest.approx(known["K_w0"], rel=1e-6)
-    assert f"K_w0 may well be {low:.3g} N/m or {high:.3g} N/m instead of" in " ".join(
-        str(made).split()
-    )
+    assert f"K_w0 may well be {low:.3g} N/m or {high:.3g} N/m instead of" in in_a_line(made)
     assert made.to_dict()["elsewhere"]["K_w0"][0] == {"value": low, "stderr": below}
 
 
@@ -344,10 +330,10 @@ def criterion(made, power):
 @functools.cache
 def experiment(quantity):
     with jax.enable_x64(True):
-        return Experiment.of(hold(), quantity, Lengthening.flat(1e-3, BAND, SECONDS), None)
+        return Experiment.of(hold(), quantity, FLAT, None)
 
 
-@pytest.mark.parametrize("quantity", [("K_w0",), ("C_z0",), ("K_w0", "K_z0", "C_w0", "C_z0")])
+@pytest.mark.parametrize("quantity", [("K_w0",), ("C_z0",), BASES])
 def test_the_optimum_obeys_the_equivalence_theorem(quantity):
     """No direction towards any step of the density lowers the variance, and those that are used
     leave it as it is."""
@@ -388,7 +374,7 @@ def test_limits_are_kept():
     assert made.speed == pytest.approx(np.max(np.abs(velocity)), rel=1e-2)
     assert max(made.peak / 1.2e-3, made.speed / 8e-3) > 0.95  # and used
     limit = "peak" if made.peak / 1.2e-3 > made.speed / 8e-3 else "speed"
-    words = " ".join(str(made).split())
+    words = in_a_line(made)
     assert (
         made.rms < 0.9e-3
         and f"limit that you gave with --{limit} ({limit}=) keeps it below 1 mm rms" in words
@@ -415,9 +401,7 @@ def test_an_even_design_is_the_flat_one():
     made = designed(spread=1.0)
     assert made.gain == pytest.approx(1.0)
     assert not made.moves and "this motion is flat itself" in str(made)
-    assert "so it is a good one to begin with" in " ".join(
-        str(made).split()
-    ) and "too vague" not in str(made)
+    assert "so it is a good one to begin with" in in_a_line(made) and "too vague" not in str(made)
 
 
 def test_a_flat_motion_is_drawn_and_called_once(tmp_path):
@@ -448,7 +432,7 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
     made = designed(durations=(SECONDS, 2 * SECONDS), error=0.04)
     assert made.by_seconds[SECONDS] == pytest.approx(made.stderr, rel=1e-9)
     twice = designed(seconds=2 * SECONDS)
-    for name in ("K_w0", "K_z0", "C_w0", "C_z0"):
+    for name in BASES:
         assert made.by_seconds[2 * SECONDS][name] == pytest.approx(twice.stderr[name], rel=0.1)
     assert made.needed is not None and made.needed[0] == 0.04
     found = designed(durations=(made.needed[1],))
@@ -457,7 +441,7 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
     )
     assert (
         f"to know K_w0 to 4 % (standard error), {made.needed[1]:.3g} s of record are enough"
-        in " ".join(str(made).split())
+        in in_a_line(made)
     )
     assert "for records of other lengths" in str(made) and "of other lengths" not in str(designed())
     assert "no length of the record" in str(designed(error=1e-9))
@@ -465,16 +449,14 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
         made.to_dict()["needed"]["seconds"] == made.needed[1]
         and designed(error=1e-9).to_dict()["needed"]["seconds"] is None
     )
-    assert "what is known without this record is enough" in " ".join(
-        str(designed(error=0.999)).split()
-    )
-    small = " ".join(str(designed(rms=1e-4, error=0.04)).split())
+    assert "what is known without this record is enough" in in_a_line(designed(error=0.999))
+    small = in_a_line(designed(rms=1e-4, error=0.04))
     assert re.search(
         r"to 4 % \(standard error\), a record of \S+ hours would be needed, which nobody holds",
         small,
     )
-    assert "less than 1 s of this motion would tell that. Play one period" in " ".join(
-        str(designed(rms=0.1, error=0.1)).split()
+    assert "less than 1 s of this motion would tell that. Play one period" in in_a_line(
+        designed(rms=0.1, error=0.1)
     )
     with pytest.raises(ValueError, match="give at least 8 s"):
         designed(seconds=1.0)
@@ -494,7 +476,7 @@ def test_a_wider_band_is_told_of_where_it_tells_more():
         made.flat["K_w0"] > 1.3 * other.flat["K_w0"]
         and made.stderr["K_w0"] > 0.05 * made.values["K_w0"]
     )
-    assert ("design again with --band 0.1:2 (band=(0.1, 2))" in " ".join(str(made).split())) == told
+    assert ("design again with --band 0.1:2 (band=(0.1, 2))" in in_a_line(made)) == told
     assert designed(band=(0.1, 20.0)).wider is None  # beyond half of the rate
     slow = designed(band=(0.1, 1.0), speed=1e-3).wider
     assert slow is not None and slow[1]["K_w0"] > made.wider[1]["K_w0"]
@@ -502,9 +484,9 @@ def test_a_wider_band_is_told_of_where_it_tells_more():
 
 def test_a_quantity_of_several_targets_has_its_plain_name():
     known = {"K_z0": 1.0, "K_w_tangent@held": 1.0, "K_w_tangent@moved": 1.0, "model_mean@held": 1.0}
-    assert _named("K_w_tangent", known, [None, "moved", "held"]) == "K_w_tangent@moved"
-    assert _named("K_w_tangent", known, ["held", "moved"]) == "K_w_tangent@held"
-    assert [_named(n, known, [None, "moved", "held"]) for n in ("K_z0", "model_mean", "K")] == [
+    assert _full_name("K_w_tangent", known, [None, "moved", "held"]) == "K_w_tangent@moved"
+    assert _full_name("K_w_tangent", known, ["held", "moved"]) == "K_w_tangent@held"
+    assert [_full_name(n, known, [None, "moved", "held"]) for n in ("K_z0", "model_mean", "K")] == [
         "K_z0",
         "model_mean@held",
         "K",
@@ -539,7 +521,7 @@ def test_the_standard_designs_know_what_a_flat_motion_tells():
     assert bands == [(0.5, 10.0), pytest.approx(usual)] and usual[0] == 0.5
     (small, large), made = report.designs, designed(band=usual)
     assert {"K_w0", "K_z0", "C_w0", "C_z0"} <= set(large.gained)
-    for name in ("K_w0", "K_z0", "C_w0", "C_z0"):
+    for name in BASES:
         assert large.quantities[name].stderr == pytest.approx(made.flat[name], rel=1e-6)
         assert small.quantities[name].stderr > large.quantities[name].stderr
     assert large.task == "PrescribedLength (insertion moved by a motor, force measured), P_w = 5 N"
@@ -564,7 +546,7 @@ def test_a_measured_stiffness_with_these_errors_tells_the_same(x64):
     free, found = (*DEFAULT_FREE, "P_w", "m_w", "m_z"), {}
     for given in (None, measured):
         problem, theta = fitted_problem(fitted(task, free, stiffness=given), None)
-        found[given is None] = information_of(problem, seen_here(problem, theta))
+        found[given is None] = information_of(problem, expansion_at(problem, theta))
     added = (found[False] - found[True])[:4, :4]
     expected = information(lengthening)
     size = np.sqrt(np.diag(expected))
@@ -619,7 +601,7 @@ def test_the_page(tmp_path, monkeypatch):
 def test_in_words():
     text = str(designed())
     assert max(map(len, text.splitlines())) <= 80
-    said = " ".join(text.split())
+    said = in_a_line(text)
     assert (
         f"would measure K_w0 to {100 * designed().stderr['K_w0'] / designed().values['K_w0']:.2g} %"
         in said

@@ -28,7 +28,7 @@ from jaxmuscle.response._expected import noise_variance
 from jaxmuscle.response._linearised import linearise
 from jaxmuscle.response._transfer import harmonic_system
 from jaxmuscle.uncertainty._chains import Chains, sample
-from jaxmuscle.uncertainty._posterior_checks import diagnosed, modes_of, verdict
+from jaxmuscle.uncertainty._posterior_checks import diagnose, modes_of, verdict
 from jaxmuscle.uncertainty._posterior_density import density_about
 from jaxmuscle.uncertainty._profile import _in_words
 
@@ -70,17 +70,17 @@ def test_chains_of_a_normal_density():
     found = chains_of(0.0, draws=4000)
     draws = found.s.reshape(-1, 3)
     for i, sd in enumerate((1.0, 0.1, 10.0)):
-        _, bulk, _ = diagnosed(found.s[:, :, i])
+        _, bulk, _ = diagnose(found.s[:, :, i])
         assert abs(draws[:, i].mean()) < 4 * sd / np.sqrt(bulk)
         assert draws[:, i].std() == pytest.approx(sd, rel=4 / np.sqrt(2 * bulk) + 0.02)
-    assert verdict(found, {str(i): diagnosed(found.s[:, :, i]) for i in range(3)}, ("0",))[0]
+    assert verdict(found, {str(i): diagnose(found.s[:, :, i]) for i in range(3)}, ("0",))[0]
 
 
 def test_chains_that_do_not_mix_are_found_out():
     found = chains_of(40.0, key=1)
     # with other keys all starts may lie on one side
     assert len(set(np.sign(found.s[:, -1, 0]))) == 2
-    success, message = verdict(found, {"x": diagnosed(found.s[:, :, 0])}, ("x",))
+    success, message = verdict(found, {"x": diagnose(found.s[:, :, 0])}, ("x",))
     assert not success and "did not mix" in message and "longer chains" in message
 
 
@@ -107,7 +107,7 @@ def test_divergences_are_a_failure():
     diverging = np.zeros(shape, dtype=bool)
     diverging[0, :9] = True
     made = Chains(draws, np.zeros(shape), np.ones(shape), np.ones(shape, dtype=int), diverging, 0.5)
-    success, message = verdict(made, {"x": diagnosed(draws[:, :, 0])}, ("x",))
+    success, message = verdict(made, {"x": diagnose(draws[:, :, 0])}, ("x",))
     assert not success and message.startswith("9 of 4000 draws diverged")
 
 
@@ -248,7 +248,6 @@ def sloppy():
 @pytest.mark.parametrize(
     ("ends", "words"),
     [
-        ((None, None), "open"),
         ((None, 2.0), "below 2 N (open downwards)"),
         ((1.0, None), "above 1 N (open upwards)"),
         ((1.0, 2.0), "1 to 2 N"),
@@ -342,7 +341,7 @@ def test_the_common_scale_is_counted_from_the_coefficient_of_variation():
         np.testing.assert_allclose(np.diff(ours), np.diff(theirs), atol=1e-6)
 
         def variation(s):
-            return density.log_variation(density.levelled(s)[0], 0, level.weight)[0]
+            return density.log_variation(density.from_levels(s)[0], 0, level.weight)[0]
 
         places = np.tile(np.asarray(density.point), (2, 1))
         places[1, level.column] += 0.1

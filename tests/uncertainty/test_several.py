@@ -17,7 +17,7 @@ from jaxmuscle.checks import _bootstrap
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._likelihood import Likelihood
-from jaxmuscle.uncertainty._design_information import information_of, seen_here
+from jaxmuscle.uncertainty._design_information import expansion_at, information_of
 from jaxmuscle.uncertainty._posterior_density import density_about
 
 TRUTH = jm.Isometric().replace(
@@ -131,13 +131,13 @@ def test_information_adds_up(x64):
     joint = both()
     tasks = tuple(joint.tasks.values())
     problem = reopened(joint)
-    whole = information_of(problem, seen_here(problem, problem.theta_of(tasks)))
+    whole = information_of(problem, expansion_at(problem, problem.theta_of(tasks)))
     parts = []
     for i, name in enumerate(TASKS):
         single = dataclasses.replace(
             reopened(alone(name)), parts=(problem.parts[i],), coordinates=problem.coordinates
         )
-        parts.append(information_of(single, seen_here(single, problem.theta_of(tasks))))
+        parts.append(information_of(single, expansion_at(single, problem.theta_of(tasks))))
     np.testing.assert_allclose(whole, sum(parts), rtol=1e-9, atol=1e-9 * np.abs(whole).max())
     found = jm.identifiability(joint)
     np.testing.assert_allclose(

@@ -11,6 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 SYNCED_AT_ONCE = 32
 
 
@@ -90,8 +92,10 @@ def remove(folder: Path, *names: str) -> None:
 
 
 def nulled(value: Any) -> Any:
-    """Nested tables and lists with None for every number that is not finite: JSON has no word for
-    it."""
+    """Nested tables, lists and arrays with None for every number that is not finite: JSON has no
+    word for it."""
+    if isinstance(value, np.ndarray):
+        return nulled(value.tolist())
     if isinstance(value, dict):
         return {key: nulled(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -1,7 +1,7 @@
 """Which colour of noise, with or without a harmonic, or which richer model explains a spectrum."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,10 +31,8 @@ from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised
 
-from ._comparison import NEEDED, ComparedModel, Comparison, score_difference
+from ._comparison import NEEDED, ComparedModel, Comparison, Model, score_difference
 from ._evidence import Candidate, Folds, held_out, masked_bins, maxima, without_harmonic
-
-Value = TypeVar("Value")
 
 
 def compare_noise(  # noqa: PLR0913 (options of a public call)
@@ -99,23 +97,19 @@ def compare_noise(  # noqa: PLR0913 (options of a public call)
             f"groups = {groups}: give a number from 2 to that of the target's bins,"
             f" {len(target.bins)}"
         )
+    given = {"fix": fix, "priors": priors, "bounds": bounds}
+    given = {argument: proper_values(values) for argument, values in given.items()}
     with told(progress, f"comparing models on {target.name}") as tell, fitting():
-        fixed = proper_values(fix)
-        carried, left_out = _carried(task, noises, fixed)
-        problems = _setups(
-            carried, target, free, fixed, proper_values(priors), proper_values(bounds), key
-        )
+        carried, left_out = _carry(task, noises, given["fix"])
+        problems = _setups(carried, target, proper_names(free), given, key)
         folds = None if target.segments is None else Folds.of([target], groups)
-        found: dict[tuple[str, bool], dict[str, Any]] = {}
-        for number, (noise, problem) in enumerate(
-            sorted(problems.items(), key=lambda item: RICHER.get(item[0], 0))
-        ):
-            known = _poorer(noise, task, found)
-            for harmonic in (
-                (True, False)
-                if float(problem.parts[0].task["harmonic_amplitude"]) > 0
-                else (False,)
-            ):
+        found: dict[Model, dict[str, Any]] = {}
+        # the poorer ones first: a richer model begins where they ended
+        order = sorted(problems, key=lambda noise: RICHER.get(noise, 0))
+        for number, noise in enumerate(order):
+            problem, known = problems[noise], _poorer(noise, task, found)
+            present = float(problem.parts[0].task["harmonic_amplitude"]) > 0
+            for harmonic in (True, False) if present else (False,):
                 what = f"{noise}, {'with' if harmonic else 'without'} harmonic"
                 tell(what, (number + 0.5 * (not harmonic)) / len(problems))
                 found[noise, harmonic] = _fitted(problem, folds, known, harmonic=harmonic)
@@ -128,22 +122,23 @@ def compare_noise(  # noqa: PLR0913 (options of a public call)
     return Comparison(target, _rows(found), left_out, tasks, fitted, float(needed), groups, seed)
 
 
-def _carried(
+def _carry(
     task: AbstractTask, noises: Iterable[str], fix: dict[str, float]
 ) -> tuple[dict[str, AbstractTask], dict[str, str]]:
     """The task with each noise, or why it cannot have it."""
     carried: dict[str, AbstractTask] = {}
     left_out: dict[str, str] = {}
+    known = (*NOISES, *RICHER)
     for name in dict.fromkeys(noises):
-        if name not in (*NOISES, *RICHER):
-            raise ValueError(f"noises: {name!r}: {choices(name, (*NOISES, *RICHER))}")
+        if name not in known:
+            raise ValueError(f"noises: {name!r}: {choices(name, known)}")
         try:
             if name in RICHER:
                 carried[name] = on_rung(task, RICHER[name])
+            elif type(task.noise) is NOISES[name]:
+                carried[name] = task
             else:
-                carried[name] = (
-                    task if type(task.noise) is NOISES[name] else with_noise(task, name, fix)
-                )
+                carried[name] = with_noise(task, name, fix)
         except ValueError as error:
             left_out[name] = str(error)
     if len(carried) < 2:
@@ -158,42 +153,31 @@ def _setups(
     carried: dict[str, AbstractTask],
     target: Target,
     free: Iterable[str] | None,
-    fix: dict[str, float],
-    priors: dict[str, float | None],
-    bounds: dict[str, tuple[float, float]],
+    given: dict[str, dict[str, Any]],
     key: Key,
 ) -> dict[str, FitProblem]:
     """The fit of each noise; what concerns a parameter that only other noises have is left to
     them."""
     everywhere = {name for task in carried.values() for name in task.parameter_names}
     everywhere |= {name for name in PARAMETERS if name.startswith("noise_")}
-    chosen = proper_names(free)
-    for argument, names in (
-        ("free", chosen or ()),
-        ("fix", fix),
-        ("priors", priors),
-        ("bounds", bounds),
-    ):
+    for argument, names in ({"free": free or ()} | given).items():
         for name in names:
             if name not in everywhere:
                 raise ValueError(f"{argument}: {unknown_parameter(name, everywhere)}")
     problems = {}
     for noise, task in carried.items():
         own = set(task.parameter_names) - set(HARMONIC if RICHER.get(noise, 0) > 1 else ())
-        names = None if chosen is None else [n for n in chosen if n in own]
-        options = FitOptions(
-            free=names, fix=_of(fix, own), priors=_of(priors, own), bounds=_of(bounds, own), key=key
-        )
-        problems[noise] = planned(task, target, options).problem
+        names = None if free is None else [n for n in free if n in own]
+        mine: dict[str, Any] = {
+            argument: {n: value for n, value in values.items() if n in own}
+            for argument, values in given.items()
+        }
+        problems[noise] = planned(task, target, FitOptions(free=names, key=key, **mine)).problem
     return problems
 
 
-def _of(given: dict[str, Value], names: set[str]) -> dict[str, Value]:
-    return {name: value for name, value in given.items() if name in names}
-
-
 def _poorer(
-    noise: str, task: AbstractTask, found: Mapping[tuple[str, bool], dict[str, Any]]
+    noise: str, task: AbstractTask, found: Mapping[Model, dict[str, Any]]
 ) -> dict[str, float] | None:
     """Where the best of the poorer models of the same noise ended; None for a model that has no
     resonance."""
@@ -205,10 +189,13 @@ def _poorer(
     ]
     if rung < RICHER["resonance"] or not poorer:
         return None
-    ended = min(poorer, key=lambda values: values["aic"] if np.isfinite(values["aic"]) else np.inf)[
-        "task"
-    ]
+    ended = min(poorer, key=_height)["task"]
     return {name: float(ended[name]) for name in ended.parameter_names}
+
+
+def _height(values: Mapping[str, Any]) -> float:
+    """The AIC, of a failed search the highest."""
+    return values["aic"] if np.isfinite(values["aic"]) else np.inf
 
 
 def _fitted(
@@ -244,20 +231,20 @@ def _fitted(
     }
 
 
-def _rows(found: dict[tuple[str, bool], dict[str, Any]]) -> tuple[ComparedModel, ...]:
+def _rows(found: dict[Model, dict[str, Any]]) -> tuple[ComparedModel, ...]:
     """What needs all models: differences to the lowest AIC, and weights."""
-    aic = {model: values["aic"] for model, values in found.items()}
-    best = min(aic, key=lambda model: aic[model] if np.isfinite(aic[model]) else np.inf)
-    weight = {model: np.exp(-0.5 * (value - aic[best])) for model, value in aic.items()}
+    best = min(found.values(), key=_height)
+    above = {model: values["aic"] - best["aic"] for model, values in found.items()}
+    whole = np.nansum(np.exp(-0.5 * np.array([*above.values()])))
     rows = []
     for model, values in found.items():
         scores = values["scores"]
-        difference, error = score_difference(scores, found[best]["scores"])
+        difference, error = score_difference(scores, best["scores"])
         rows.append(
             ComparedModel(
                 *model,
-                delta_aic=aic[model] - aic[best],
-                weight=float(weight[model] / np.nansum(list(weight.values()))),
+                delta_aic=above[model],
+                weight=float(np.exp(-0.5 * above[model]) / whole),
                 score=None if scores is None else float(scores.sum()),
                 score_difference=difference,
                 score_stderr=error,

@@ -1,7 +1,6 @@
 """What a comparison of noises found: a row for each model, which of them can be told apart, in
 numbers and words."""
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
@@ -11,10 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
-from jaxmuscle._common.files import write_text
+from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle.data._target import Target
@@ -30,12 +28,47 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-FORMAT = 1
 NEEDED = 6.0
+# noise, harmonic, then numbers
+LINE = "  {:<19}{:<5}{:>9}{:>5}{:>9}{:>7}{:>9}  {}"
+HEAD = LINE.format("noise", "line", "ln L", "par", "ΔAIC", "weight", "p", "held-out")
 LEGEND = (
     "  line: with a harmonic. par: effective number of parameters. weight: Akaike weight. p: of the"
     " verdict. held-out: score for bins left out, minus that of the first row, ± standard error"
 )
+# What is printed, by what it is about.
+WORDS = {
+    "prefer": "the data prefer {better} to {worse}: {numbers}",
+    "unsettled": (
+        "{better} and {worse} are not compared: the search of {unsettled} did not converge"
+    ),
+    "disagree": (
+        "{better} and {worse} cannot be told apart: AIC and held-out score disagree (for {better}:"
+        " {numbers})"
+    ),
+    "near": (
+        "{better} and {worse} cannot be told apart (for {better}: {numbers}); to tell them apart,"
+        " the AIC must differ by {needed:.3g} or more{chance}"
+    ),
+    "chance": ", since chance alone would find some frequency that fits a little better",
+    "score": ", held-out score {side} by {gain:.1f} ± {error:.1f}",
+    "no segments": "the target states no segments: nothing was held out, the AIC decides alone",
+    "not judged": (
+        "whether any model describes the data cannot be judged: the target states neither segments"
+        " nor sigma"
+    ),
+    "none fits": (
+        "none of the models describes the data (p < 0.01 for each): do not believe the best of them"
+        " either"
+    ),
+    "all fit": "every model describes the data",
+    "some fit": "these describe the data (p >= 0.01): {fine}",
+    "mean": (
+        "  The fit of these recordings also uses their mean force. So its p and AIC are a little"
+        " different"
+    ),
+    "richer": "  the richer models that `fit` tries: {names}",
+}
 NUMBERS = (
     "log_likelihood",
     "parameters",
@@ -49,6 +82,8 @@ NUMBERS = (
     "adequacy_p",
 )
 COLUMNS = ("noise", "harmonic", *NUMBERS, "adequate", "success")
+Bins = Float[np.ndarray, " bins"]
+Model = tuple[str, bool]  # the name of its noise, whether it has a harmonic
 
 
 class Evidence(NamedTuple):
@@ -56,8 +91,8 @@ class Evidence(NamedTuple):
     its climbs settled."""
 
     aic: float
-    scores: Float[np.ndarray, " bins"] | None
-    settled: bool = True
+    scores: Bins | None
+    success: bool = True
 
 
 class Decision(Printed, Result, eqx.Module):
@@ -89,38 +124,33 @@ class Decision(Printed, Result, eqx.Module):
         return self.score_gain is not None and not self.score_gain * self.aic_gain > 0
 
     def __str__(self) -> str:
-        better, worse = (self.a, self.b) if self.aic_gain >= 0 else (self.b, self.a)
+        side = 1 if self.aic_gain >= 0 else -1
         numbers = f"AIC lower by {abs(self.aic_gain):.1f}"
         if self.score_gain is not None:
-            gain = self.score_gain if self.aic_gain >= 0 else -self.score_gain
-            numbers += (
-                f", held-out score {'higher' if gain >= 0 else 'lower'} by {abs(gain):.1f} ±"
-                f" {self.score_stderr:.1f}"
-            )
-        if self.winner is not None:
-            return f"the data prefer {better} to {worse}: {numbers}"
-        open_ = f"{better} and {worse} cannot be told apart"
-        if self.unsettled:
-            whose = " and of ".join(self.unsettled)
-            return f"{better} and {worse} are not compared: the search of {whose} did not converge"
-        apart = f"to tell them apart, the AIC must differ by {self.needed:.3g} or more"
-        apart += ", since chance alone would find some frequency that fits a little better" * (
-            self.needed > NEEDED
+            gain = side * self.score_gain
+            about = {"side": "higher" if gain >= 0 else "lower", "error": self.score_stderr}
+            numbers += WORDS["score"].format(gain=abs(gain), **about)
+        better, worse = (self.a, self.b)[::side]
+        case = (
+            "prefer"
+            if self.winner is not None
+            else "unsettled"
+            if self.unsettled
+            else "disagree"
+            if abs(self.aic_gain) >= self.needed
+            else "near"
         )
-        if abs(self.aic_gain) >= self.needed:
-            return f"{open_}: AIC and held-out score disagree (for {better}: {numbers})"
-        return f"{open_} (for {better}: {numbers}); {apart}"
+        return WORDS[case].format(
+            better=better,
+            worse=worse,
+            numbers=numbers,
+            unsettled=" and of ".join(self.unsettled),
+            needed=self.needed,
+            chance=WORDS["chance"] * (self.needed > NEEDED),
+        )
 
 
-def decided(names: tuple[str, str], a: Evidence, b: Evidence, needed: float = NEEDED) -> Decision:
-    """The decision between two models, called by `names`."""
-    unsettled = tuple(name for name, one in zip(names, (a, b), strict=True) if not one.settled)
-    return Decision(*names, b.aic - a.aic, *score_difference(a.scores, b.scores), needed, unsettled)
-
-
-def score_difference(
-    a: Float[np.ndarray, " bins"] | None, b: Float[np.ndarray, " bins"] | None
-) -> tuple[float | None, float | None]:
+def score_difference(a: Bins | None, b: Bins | None) -> tuple[float | None, float | None]:
     """`Σ (a_k - b_k)` and its standard error √n sd(a_k - b_k) (Vehtari, Gelman & Gabry 2017,
     10.1007/s11222-016-9696-4)."""
     if a is None or b is None:
@@ -153,7 +183,7 @@ class ComparedModel(eqx.Module):
     chi2_per_bin: float
     adequacy_p: float | None
     success: bool
-    scores: Float[np.ndarray, " bins"] | None
+    scores: Bins | None
 
     needed: ClassVar[float] = NEEDED
 
@@ -161,12 +191,6 @@ class ComparedModel(eqx.Module):
     def adequate(self) -> bool | None:
         """Whether the model describes the data, `adequacy_p >= 0.01`."""
         return None if self.adequacy_p is None else self.adequacy_p >= ADEQUATE
-
-    @property
-    def evidence(self) -> "Evidence":
-        """What decides between models: AIC, the score of every bin (or None), whether the search
-        converged."""
-        return Evidence(self.aic, self.scores, self.success)
 
     @property
     def label(self) -> str:
@@ -182,6 +206,12 @@ def lowest(rows: list[Row]) -> Row:
     return min(rows, key=lambda row: row.aic if math.isfinite(row.aic) else math.inf)
 
 
+def decide(names: tuple[str, str], a: Row, b: Row, needed: float = NEEDED) -> Decision:
+    """The decision between two models, called by `names`."""
+    unsettled = tuple(name for name, one in zip(names, (a, b), strict=True) if not one.success)
+    return Decision(*names, b.aic - a.aic, *score_difference(a.scores, b.scores), needed, unsettled)
+
+
 class Comparison(Printed, Result, eqx.Module):
     """Which noise a spectrum speaks for.
 
@@ -194,8 +224,8 @@ class Comparison(Printed, Result, eqx.Module):
     target: Target
     rows: tuple[ComparedModel, ...]
     left_out: dict[str, str]
-    tasks: dict[tuple[str, bool], AbstractTask]
-    fitted: dict[tuple[str, bool], Float[np.ndarray, " bins"]]
+    tasks: dict[Model, AbstractTask]
+    fitted: dict[Model, Bins]
     harmonic_needed: float
     groups: int
     seed: int | None
@@ -222,31 +252,25 @@ class Comparison(Printed, Result, eqx.Module):
         `ValueError` for another noise."""
         rows = [row for row in self.rows if row.noise == noise]
         if not rows:
-            raise ValueError(
-                f"noise = {noise!r}: not compared; there are"
-                f" {', '.join(dict.fromkeys(r.noise for r in self.rows))}"
-            )
+            names = ", ".join(dict.fromkeys(row.noise for row in self.rows))
+            raise ValueError(f"noise = {noise!r}: not compared; there are {names}")
         return lowest(rows)
 
     def between(self, a: str, b: str) -> Decision:
         """Two noises, each with or without harmonic, whichever has the lower AIC."""
-        return decided((a, b), self.of(a).evidence, self.of(b).evidence)
+        return decide((a, b), self.of(a), self.of(b))
 
     @property
     def harmonic(self) -> Decision | None:
         """Of noises that were fitted both ways the best with a harmonic against the best without;
         None if there is none."""
         both = {row.noise for row in self.rows if row.harmonic}
-        sides = [
-            [row for row in self.rows if row.harmonic == present and row.noise in both]
-            for present in (True, False)
-        ]
-        if not all(sides):
+        rows = [row for row in self.rows if row.noise in both]
+        present, absent = ([r for r in rows if r.harmonic == side] for side in (True, False))
+        if not present or not absent:
             return None
         names = ("a harmonic", "no harmonic")
-        return decided(
-            names, lowest(sides[0]).evidence, lowest(sides[1]).evidence, self.harmonic_needed
-        )
+        return decide(names, lowest(present), lowest(absent), self.harmonic_needed)
 
     @property
     def verdict(self) -> tuple[str, ...]:
@@ -255,39 +279,26 @@ class Comparison(Printed, Result, eqx.Module):
         said = [str(self.between(first, other)) for other in others]
         if self.harmonic is not None:
             asked = any(row.harmonic for row in self.rows if row.noise == first)
-            said.append(
-                str(self.harmonic)
-                if asked
-                else f"among the models without resonance, {self.harmonic}"
-            )
+            said.append(f"{'' if asked else 'among the models without resonance, '}{self.harmonic}")
         if self.best.scores is None:
-            said.append(
-                "the target states no segments: nothing was held out, the AIC decides alone"
-            )
+            said.append(WORDS["no segments"])
         return tuple(said)
 
     @property
     def adequate(self) -> str:
         """Which models describe the data: that one is better than another does not say that it is
         good."""
-        known = [row for row in self.rows if row.adequate is not None]
-        fine = [row.label for row in known if row.adequate]
-        if not known:
-            return (
-                "whether any model describes the data cannot be judged: the target states neither"
-                " segments nor sigma"
-            )
-        if not fine:
-            return (
-                "none of the models describes the data (p < 0.01 for each): do not believe the best"
-                " of them either"
-            )
-        every = len(fine) == len(self.rows)
-        return (
-            "every model describes the data"
-            if every
-            else f"these describe the data (p >= 0.01): {'; '.join(fine)}"
+        fine = [row.label for row in self.rows if row.adequate]
+        case = (
+            "not judged"
+            if all(row.adequate is None for row in self.rows)
+            else "none fits"
+            if not fine
+            else "all fit"
+            if len(fine) == len(self.rows)
+            else "some fit"
         )
+        return WORDS[case].format(fine="; ".join(fine))
 
     def table(self) -> list[dict[str, Any]]:
         """A row for each model, with the columns that *Results as numbers* lists
@@ -303,34 +314,22 @@ class Comparison(Printed, Result, eqx.Module):
         what there is not."""
         import xarray
 
-        names, present = list(dict.fromkeys(row.noise for row in self.rows)), [True, False]
-        found = {(row.noise, row.harmonic): row for row in self.rows}
-        empty = np.full(len(self.target.bins), np.nan)
-
-        def grid(read: Any, missing: Any) -> list[list[Any]]:
-            values = [
-                [read(found[n, h]) if (n, h) in found else None for h in present] for n in names
-            ]
-            return [[missing if value is None else value for value in row] for row in values]
-
-        dims = ("noise", "harmonic")
-        numbers = {
-            name: (dims, grid(lambda row, name=name: getattr(row, name), np.nan))
-            for name in NUMBERS
-        }
-        spectra = {
-            "fitted": grid(lambda row: self.fitted[row.noise, row.harmonic], empty),
-            "scores": grid(lambda row: row.scores, empty),
-        }
+        noises, present = list(dict.fromkeys(row.noise for row in self.rows)), [True, False]
+        dims, shape = ("noise", "harmonic"), (len(noises), 2)
+        whole = *shape, len(self.target.bins)
+        data: dict[str, Any] = {name: (dims, np.full(shape, np.nan)) for name in NUMBERS}
+        for name in ("fitted", "scores"):
+            data[name] = (*dims, "frequency"), np.full(whole, np.nan)
+        data["success"] = dims, np.zeros(shape, bool)
+        for row in self.rows:
+            at = noises.index(row.noise), present.index(row.harmonic)
+            values = vars(row) | {"fitted": self.fitted[row.noise, row.harmonic]}
+            for name, (_, grid) in data.items():
+                grid[at] = values[name]  # None becomes NaN
         return xarray.Dataset(
-            numbers
-            | {name: ((*dims, "frequency"), values) for name, values in spectra.items()}
-            | {
-                "success": (dims, grid(lambda row: row.success, False)),
-                "target": ("frequency", self.target.proportional_power),
-            },
+            data | {"target": ("frequency", self.target.proportional_power)},
             coords={
-                "noise": names,
+                "noise": noises,
                 "harmonic": present,
                 "frequency": ("frequency", self.target.frequency, {"units": "Hz"}),
             },
@@ -339,39 +338,34 @@ class Comparison(Printed, Result, eqx.Module):
             | {f"version_{package}": number for package, number in self.versions.items()},
         )
 
-    def to_json(self) -> str:
-        """Everything as JSON, the fitted tasks as presets are."""
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as nested tables, the fitted tasks as presets are."""
+        models = [
+            {
+                "noise": row.noise,
+                "harmonic": row.harmonic,
+                "fitted": self.fitted[row.noise, row.harmonic],
+                "scores": row.scores,
+                "task": task_to_table(self.tasks[row.noise, row.harmonic]),
+            }
+            for row in self.rows
+        ]
+        own = ("adequate", "verdict", "left_out", "harmonic_needed", "groups", "seed")
         table = {
-            "format": FORMAT,
+            "format": 1,
             "target": self.target.name,
-            "rows": [
-                {name: with_nulls(value) for name, value in row.items()} for row in self.table()
-            ],
-            "adequate": self.adequate,
-            "verdict": list(self.verdict),
-            "left_out": self.left_out,
-            "harmonic_needed": self.harmonic_needed,
-            "groups": self.groups,
-            "seed": self.seed,
-            "frequency_hz": self.target.frequency.tolist(),
-            "models": [
-                {
-                    "noise": row.noise,
-                    "harmonic": row.harmonic,
-                    "fitted": with_nulls(self.fitted[row.noise, row.harmonic]),
-                    "scores": with_nulls(row.scores),
-                    "task": task_to_table(self.tasks[row.noise, row.harmonic]),
-                }
-                for row in self.rows
-            ],
+            "rows": self.table(),
+            **{name: getattr(self, name) for name in own},
+            "frequency_hz": self.target.frequency,
+            "models": models,
             "target_table": self.target.to_table(),
             "versions": self.versions,
         }
-        return json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        return nulled(table)
 
     def save(self, path: str | Path) -> None:
-        """Write `to_json` atomically."""
-        write_text(path, self.to_json())
+        """Write `to_dict` as JSON, atomically."""
+        write_json(path, self.to_dict())
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The target with the best fit of each noise, AIC and held-out score of every model."""
@@ -379,41 +373,29 @@ class Comparison(Printed, Result, eqx.Module):
 
     def __str__(self) -> str:
         kind = type(next(iter(self.tasks.values()))).__name__
-        head = (
-            f"  {'noise':<19}{'line':<5}{'ln L':>9}{'par':>5}{'ΔAIC':>9}{'weight':>7}{'p':>9} "
-            " held-out"
-        )
-        lines = [f"{self.target.name} ({self.target.provenance}), {kind}: which noise?", head]
+        lines = [f"{self.target.name} ({self.target.provenance}), {kind}: which noise?", HEAD]
         for row in sorted(self.rows, key=lambda row: row.aic):
-            held = (
-                ""
-                if row.score is None
-                else f"{_short(row.score_difference)} ± {_short(row.score_stderr)}"
-            )
-            p = row.adequacy_p
-            line = f"  {row.noise:<19}{'yes' if row.harmonic else 'no':<5}"
-            line += f"{_short(row.log_likelihood):>9}{row.parameters:>5.1f}"
-            line += f"{_short(row.delta_aic):>9}{row.weight:>7.2f}"
-            line += (
-                f"{'' if p is None else probability(p).removeprefix('p ').removeprefix('= '):>9}"
-            )
-            lines.append(f"{line}  {held if row.success else 'failed'}")
-        lines.append(LEGEND)
-        if self.target.mean is not None:
+            held = "" if row.success else "failed"
+            if row.success and row.score is not None:
+                held = f"{_short(row.score_difference)} ± {_short(row.score_stderr)}"
+            p = "" if row.adequacy_p is None else probability(row.adequacy_p)
             lines.append(
-                "  The fit of these recordings also uses their mean force. So its p and AIC are a"
-                " little different"
+                LINE.format(
+                    row.noise,
+                    "yes" if row.harmonic else "no",
+                    _short(row.log_likelihood),
+                    f"{row.parameters:.1f}",
+                    _short(row.delta_aic),
+                    f"{row.weight:.2f}",
+                    p.removeprefix("p ").removeprefix("= "),
+                    held,
+                )
             )
-        called = [
-            f"{name} ({RUNGS[rung]})"
-            for name, rung in RICHER.items()
-            if any(row.noise == name for row in self.rows)
-        ]
-        lines += [f"  the richer models that `fit` tries: {'; '.join(called)}"] * bool(called)
+        lines += [LEGEND, *[WORDS["mean"]] * (self.target.mean is not None)]
+        richer = [f"{name} ({RUNGS[rung]})" for name, rung in RICHER.items() if name in self.noises]
+        lines += [WORDS["richer"].format(names="; ".join(richer))] * bool(richer)
         said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]
-        for sentence in (self.adequate, *self.verdict, *said):
-            lines.append(f"- {sentence}")
-        return folded(lines)
+        return folded([*lines, *(f"- {one}" for one in (self.adequate, *self.verdict, *said))])
 
 
 def _short(value: Any) -> str:

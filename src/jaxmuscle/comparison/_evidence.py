@@ -23,9 +23,15 @@ from jaxmuscle.objective._starts import continued, points_about, starting_points
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._bin_law import target_law
 
-SPREAD, RANDOM, PLAIN = 24, 8, 16
-BLOCK, BLOCKS, ENOUGH = 12, 20, 1e-3
-SAME, KEPT = 1e-3, 16
+SPREAD, RANDOM, PLAIN = 24, 8, 16  # starting points: over the prior, drawn, of a smooth model
+BLOCK, BLOCKS, ENOUGH = 12, 20, 1e-3  # steps at once, how often; a gain in ln L that is too small
+SAME, KEPT = 1e-3, 16  # heights that are one maximum; starts that are followed on
+
+
+Sets = Float[np.ndarray, " sets"]
+SetsFree = Float[np.ndarray, "sets free"]
+SetsBins = Float[np.ndarray, "sets bins"]
+Settled = Bool[np.ndarray, " sets"]
 
 
 class Maxima(NamedTuple):
@@ -35,19 +41,19 @@ class Maxima(NamedTuple):
     harmonic's share of the power of each bin.
     """
 
-    theta: Float[np.ndarray, "sets free"]
-    log_likelihood: Float[np.ndarray, " sets"]
-    parameters: Float[np.ndarray, " sets"]
-    proportional: Float[np.ndarray, "sets bins"]
-    line: Float[np.ndarray, "sets bins"]
-    settled: Bool[np.ndarray, " sets"]
+    theta: SetsFree
+    log_likelihood: Sets
+    parameters: Sets
+    proportional: SetsBins
+    line: SetsBins
+    settled: Settled
 
 
 class HeldOut(NamedTuple):
     """Log density of every bin given the others that were kept, by a fit to those."""
 
-    scores: Float[np.ndarray, "sets bins"]
-    settled: Bool[np.ndarray, " sets"]
+    scores: SetsBins
+    settled: Settled
 
 
 class Candidate(NamedTuple):
@@ -109,13 +115,13 @@ def maxima(
     model: Candidate,
     starts: Float[np.ndarray, "sets starts free"],
     bins: Bins | None,
-    moving: Float[np.ndarray, "sets free"],
+    moving: SetsFree,
 ) -> Maxima:
     """A block of steps from every start, then on from those that stand at different heights to the
     highest maximum."""
     sets, count, free = starts.shape
     owner = np.repeat(np.arange(sets), count)
-    peak = _climbed(model, starts.reshape(-1, free), bins, moving, owner)
+    peak = _climb(model, starts.reshape(-1, free), bins, moving, owner)
     on = np.concatenate(
         [s * count + _different(cost) for s, cost in enumerate(peak.cost.reshape(sets, count))]
     )
@@ -144,7 +150,7 @@ def _highest(
     bins: Bins | None,
     moving: np.ndarray,
     owner: Int[np.ndarray, " rows"],
-) -> tuple[Maximum, Bool[np.ndarray, " sets"]]:
+) -> tuple[Maximum, Settled]:
     """The best row of every data set, once a block of steps improves it by less than `ENOUGH`;
     whether it came to that."""
     sets, theta = len(moving), theta.copy()
@@ -154,7 +160,7 @@ def _highest(
         rows = np.flatnonzero(~settled[owner])
         if not rows.size:
             break
-        peak = _climbed(model, theta[rows], bins, moving, owner[rows])
+        peak = _climb(model, theta[rows], bins, moving, owner[rows])
         theta[rows] = peak.theta
         reached = np.where(np.isfinite(peak.cost), peak.cost, np.inf)
         for s in np.unique(owner[rows]):
@@ -165,7 +171,7 @@ def _highest(
     return Maximum(*(np.concatenate(x) for x in zip(*best, strict=True))), settled
 
 
-def _climbed(
+def _climb(
     model: Candidate, theta: np.ndarray, bins: Bins | None, moving: np.ndarray, owner: np.ndarray
 ) -> Maximum:
     own = None if bins is None else (jax.tree.map(lambda x: np.asarray(x)[owner], bins),)
@@ -177,8 +183,8 @@ def _climbed(
 def effective_numbers(
     curvature: Float[np.ndarray, "sets all all"],
     precision: Float[np.ndarray, "free free"],
-    moving: Float[np.ndarray, "sets free"],
-) -> Float[np.ndarray, " sets"]:
+    moving: SetsFree,
+) -> Sets:
     """Effective numbers of parameters over the moving coordinates; `curvature` is that of θ and the
     offset, Λ included."""
     found = []
@@ -225,7 +231,7 @@ class Folds(NamedTuple):
         group = np.arange(len(targets[0].bins)) % groups
         masks = (group != np.arange(groups)[:, None]).astype(float)
         masks = np.concatenate([masks, masks[group] + np.eye(len(group))])
-        both = stacked([masked_bins(target, masks) for target in targets])
+        both = stack_bins([masked_bins(target, masks) for target in targets])
         kept, more = (
             Bins(*(x[:, part] for x in both)) for part in (slice(groups), slice(groups, None))
         )
@@ -240,21 +246,21 @@ def masked_bins(target: Target, masks: Float[np.ndarray, "rows bins"]) -> Bins:
         )
     law = target_law(target)
     power, half = np.log(target.proportional_power), law.degrees / 2
-    return stacked(
+    return stack_bins(
         [Bins(power, half, *precision_of(law.correlation, mask), mask) for mask in masks]
     )
 
 
-def stacked(bins: list[Bins]) -> Bins:
+def stack_bins(bins: list[Bins]) -> Bins:
     """Data sets along a new leading axis."""
     return jax.tree.map(lambda *x: np.stack(x), *bins)
 
 
 def held_out(
     model: Candidate,
-    theta: Float[np.ndarray, "sets free"],
+    theta: SetsFree,
     folds: Folds,
-    moving: Float[np.ndarray, "sets free"],
+    moving: SetsFree,
 ) -> HeldOut:
     """`ln f(p_k | bins kept; θ of the fold) = ln f(p_k and bins kept) - ln f(bins kept)`, refitted
     from `theta`."""

@@ -1,6 +1,6 @@
 """The paper's figures, Figure 2 to Figure 8, as PNG and PDF."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -11,7 +11,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxmuscle._common.files import replacing
-from jaxmuscle.plot._style import BLUE, GREEN, GREY, PALETTE, VERMILLION, ink, log_axis, styled
+from jaxmuscle.plot._style import (
+    BLUE,
+    GREEN,
+    GREY,
+    PALETTE,
+    VERMILLION,
+    Style,
+    ink,
+    log_axis,
+    styled,
+)
 from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._measures import peaks
 from jaxmuscle.spectra._settings import WINDOW
@@ -23,6 +33,9 @@ from ._readings import HIGH, LOW, Reading
 SIZE = (4.2, 2.9)  # inches: letters of 8 points are 10 pixels high on a phone of 390
 DPI = 200
 PROPORTIONAL = "Proportional power"
+PER_BIN = f"{PROPORTIONAL} (per bin)"
+FORCE = r"Force $P_\mathrm{w}$"
+Times = Float[np.ndarray, " times"]
 
 
 def draw(found: Reproduction, out: Path) -> None:
@@ -43,63 +56,33 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def _panels(rows: int, columns: int = 1, height: float = SIZE[1]) -> tuple[Figure, np.ndarray]:
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(SIZE[0], height), layout="constrained", squeeze=False
-    )
-    return figure, axes
+    size = SIZE[0], height
+    return plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
 
 
-def slow(
-    samples: Float[np.ndarray, " times"], rate: float, cutoff: float
-) -> Float[np.ndarray, " times"]:
+def slow(samples: Times, rate: float, cutoff: float) -> Times:
     """What is slower than `cutoff` [Hz], without delay."""
     return scipy.signal.sosfiltfilt(scipy.signal.butter(4, cutoff, fs=rate, output="sos"), samples)
 
 
-def _run(run: Trajectory, quantity: str, cutoff: float, words: str) -> Figure:
+def _run(run: Trajectory, quantity: str, cutoff: float) -> Figure:
     """The whole run over the mean of its held part, and the held part close up."""
     figure, axes = _panels(2, height=3.9)
-    x, held = np.atleast_2d(np.asarray(run.output))[0], np.atleast_2d(np.asarray(run.between()))[0]
+    x, held = (np.atleast_2d(np.asarray(rows))[0] for rows in (run.output, run.between()))
     whole, near = axes[:, 0]
     whole.plot(run.time, x / held.mean(), color=BLUE, lw=1.0)
     whole.axvspan(*WINDOW, color="0.93", lw=0, zorder=0)
-    whole.text(
-        WINDOW[1] - 0.1,
-        0.05,
-        "analysed",
-        ha="right",
-        va="bottom",
-        color=GREY,
-        transform=whole.get_xaxis_transform(),
-    )
-    whole.set_xlim(0, WINDOW[1])
-    whole.set_xlabel("Time (s)")
-    whole.set_ylabel(f"{quantity} / mean")
-    time = WINDOW[0] + np.arange(held.size) / run.rate
-    percent = 100 * (held / held.mean() - 1)
+    style: Style = {"color": GREY, "transform": whole.get_xaxis_transform()}
+    whole.text(WINDOW[1] - 0.1, 0.05, "analysed", ha="right", va="bottom", **style)
+    time, percent = WINDOW[0] + np.arange(held.size) / run.rate, 100 * (held / held.mean() - 1)
     near.plot(time, percent, color=BLUE, lw=0.6, alpha=0.6, label="100 samples/s")
-    near.plot(time, slow(percent, run.rate, cutoff), color=VERMILLION, lw=1.4, label=words)
-    near.set_xlim(*WINDOW)
+    below, label = slow(percent, run.rate, cutoff), f"below {cutoff:g} Hz"
+    near.plot(time, below, color=VERMILLION, lw=1.4, label=label)
     near.set_ylim(top=near.get_ylim()[1] + 0.25 * np.ptp(percent))
     near.legend(loc="upper right", ncols=2)
-    near.set_xlabel("Time (s)")
-    near.set_ylabel("Deviation from mean (%)")
+    whole.set(xlim=(0, WINDOW[1]), xlabel="Time (s)", ylabel=f"{quantity} / mean")
+    near.set(xlim=WINDOW, xlabel="Time (s)", ylabel="Deviation from mean (%)")
     return figure
-
-
-def _seed_band(ax: Axes, tuned: Tuned, *, absolute: bool) -> None:
-    power = np.asarray(tuned.force.spectrum().power)
-    rows = power if absolute else power / power.sum(1, keepdims=True)
-    low, high = np.quantile(rows, [0.05, 0.95], axis=0)
-    ax.fill_between(
-        tuned.spectrum.frequency,
-        low,
-        high,
-        color=BLUE,
-        alpha=0.18,
-        lw=0,
-        label="5 to 95 % of single runs",
-    )
 
 
 def _mark_peaks(
@@ -108,12 +91,11 @@ def _mark_peaks(
     """Arrows at the maximum and the local maxima, with their bins."""
     found = peaks(spectrum)
     for peak in dict.fromkeys((found.maximum, *found.local_maxima)):
-        at = int(np.argmin(np.abs(spectrum.frequency - peak.frequency)))
-        shift = (18, 8) if not log else (12, 8)
+        f = peak.frequency
         ax.annotate(
-            f"{peak.frequency:.3f} Hz",
-            (peak.frequency, values[at]),
-            shift,
+            f"{f:.3f} Hz",
+            (f, values[np.argmin(np.abs(spectrum.frequency - f))]),
+            (12 if log else 18, 8),
             textcoords="offset points",
             fontsize=7.5,
             arrowprops={"arrowstyle": "-", "lw": 0.6, "shrinkB": 3},
@@ -121,40 +103,35 @@ def _mark_peaks(
 
 
 def _stated(ax: Axes) -> None:
-    for f in (LOW, HIGH):
-        ax.axvline(
-            f,
-            color=GREY,
-            lw=0.7,
-            ls=":",
-            label="stated: 0.391, 4.251 Hz" if f == LOW else None,
-            zorder=0,
-        )
+    for f, label in ((LOW, "stated: 0.391, 4.251 Hz"), (HIGH, None)):
+        ax.axvline(f, color=GREY, lw=0.7, ls=":", label=label, zorder=0)
 
 
 def _spectrum(
-    spectrum: Spectrum, colour: str, *, log: bool, tuned: Tuned | None = None, stated: bool = True
+    spectrum: Spectrum,
+    colour: str,
+    *,
+    log: bool = False,
+    tuned: Tuned | None = None,
+    ordinate: str = PER_BIN,
 ) -> Figure:
-    """Proportional power, linear or with both axes logarithmic."""
-    figure, axes = _panels(1)
-    ax = axes[0, 0]
-    p = np.asarray(spectrum.power) / np.sum(spectrum.power)
+    """Proportional power (or what the ordinate says), linear or with both axes logarithmic; with
+    the band of single runs of a preset."""
+    figure, ((ax,),) = _panels(1)
+    absolute = ordinate != PER_BIN
+    values = np.asarray(spectrum.power if absolute else spectrum.proportional)
     if tuned is not None:
-        _seed_band(ax, tuned, absolute=False)
-    ax.plot(
-        spectrum.frequency,
-        p,
-        color=colour,
-        marker="o",
-        ms=2.8,
-        lw=1.2,
-        label="expected (mean over runs)",
-    )
-    if stated:
-        _stated(ax)
-    _mark_peaks(ax, spectrum, p, log=log)
+        each = tuned.force.spectrum()
+        rows = np.asarray(each.power if absolute else each.proportional)
+        band = np.quantile(rows, [0.05, 0.95], axis=0)
+        label = "5 to 95 % of single runs"
+        ax.fill_between(spectrum.frequency, *band, color=BLUE, alpha=0.18, lw=0, label=label)
+    style: Style = {"color": colour, "marker": "o", "ms": 2.8, "lw": 1.2}
+    ax.plot(spectrum.frequency, values, label="expected (mean over runs)", **style)
+    _stated(ax)
+    _mark_peaks(ax, spectrum, values, log=log)
     _frequency(ax, log)
-    ax.set_ylabel(f"{PROPORTIONAL} (per bin)")
+    ax.set_ylabel(ordinate)
     ax.legend(loc="lower left" if log else "upper right")
     return figure
 
@@ -162,8 +139,7 @@ def _spectrum(
 def _frequency(ax: Axes, log: bool) -> None:
     ax.set_xlabel("Frequency (Hz)")
     if not log:
-        ax.set_xlim(0, 12)
-        ax.set_ylim(bottom=0)
+        ax.set(xlim=(0, 12), ylim=(0, None))
         return
     ax.set_xscale("log")
     log_axis(ax, "y")
@@ -171,125 +147,48 @@ def _frequency(ax: Axes, log: bool) -> None:
     ax.set_xticks([], minor=True)
 
 
-@styled
-def fig2(found: Reproduction) -> Figure:
-    """Normalised force, tuned to [30]."""
-    return _run(found.slifkin.force, r"Force $P_\mathrm{w}$", 6.0, "below 6 Hz")
-
-
-@styled
-def fig3(found: Reproduction) -> Figure:
-    """Absolute force spectrum."""
-    figure, axes = _panels(1)
-    ax, spectrum = axes[0, 0], found.slifkin.spectrum
-    _seed_band(ax, found.slifkin, absolute=True)
-    power = np.asarray(spectrum.power)
-    ax.plot(
-        spectrum.frequency,
-        power,
-        color=BLUE,
-        marker="o",
-        ms=2.8,
-        lw=1.2,
-        label="expected (mean over runs)",
-    )
-    _stated(ax)
-    _mark_peaks(ax, spectrum, power)
-    _frequency(ax, log=False)
-    ax.set_ylabel("Power of the force (N²/Hz)")
-    ax.legend(loc="upper right")
-    return figure
-
-
-@styled
-def fig4a(found: Reproduction) -> Figure:
-    """Proportional force power."""
-    return _spectrum(found.slifkin.spectrum, BLUE, log=False, tuned=found.slifkin)
-
-
-@styled
-def fig4b(found: Reproduction) -> Figure:
-    """The same, logarithmic."""
-    return _spectrum(found.slifkin.spectrum, BLUE, log=True, tuned=found.slifkin)
-
-
-@styled
-def fig5(found: Reproduction) -> Figure:
-    """Normalised displacement at constant force."""
-    return _run(found.slifkin.displacement, r"Displacement $x_\mathrm{z}$", 6.0, "below 6 Hz")
-
-
-@styled
-def fig6a(found: Reproduction) -> Figure:
-    """Normalised force, tuned to [12]."""
-    return _run(found.hamilton.force, r"Force $P_\mathrm{w}$", 2.0, "below 2 Hz")
-
-
-@styled
-def fig6b(found: Reproduction) -> Figure:
-    """Displacement spectrum, tuned to [12]."""
-    return _spectrum(found.hamilton.moved, GREEN, log=False)
-
-
 def _source(experiment: Experiment) -> str:
     return "Simulated recordings" if experiment.simulated else "Your recordings"
 
 
-@styled
-def fig7(found: Reproduction) -> Figure:
+def _fft_and_welch(people: Experiment) -> Figure:
     """FFT above Welch."""
-    people = found.experiment
     figure, axes = _panels(2, height=4.6)
-    for ax, spectra, title in zip(
-        axes[:, 0], (people.fft, people.welch), ("FFT", "Welch"), strict=True
+    for ax, spectra, title, width in (
+        (axes[0, 0], people.fft, "FFT", 0.6),
+        (axes[1, 0], people.welch, "Welch", 1.3),
     ):
         for colour, spectrum, recording in zip(PALETTE, spectra, people.recordings, strict=False):
-            p = np.asarray(spectrum.power) / np.sum(spectrum.power)
-            ax.plot(
-                spectrum.frequency,
-                p,
-                color=colour,
-                lw=0.6 if title == "FFT" else 1.3,
-                alpha=0.8,
-                label=recording.name,
-            )
+            style: Style = {"color": colour, "lw": width, "alpha": 0.8, "label": recording.name}
+            ax.plot(spectrum.frequency, spectrum.proportional, **style)
         step = float(np.diff(spectra[0].frequency)[0])
         ax.set_title(f"{_source(people)}: {title}, {step:.4f} Hz")
         _frequency(ax, log=True)
-        ax.set_ylabel(f"{PROPORTIONAL} (per bin)")
+        ax.set_ylabel(PER_BIN)
     axes[1, 0].legend(loc="lower left")
     return figure
 
 
-@styled
-def fig8(found: Reproduction) -> Figure:
+def _pairs(people: Experiment) -> Figure:
     """One person's power against another's, and the Spearman correlation."""
-    people = found.experiment
     figure, axes = _panels(3, 2, height=6.2)
     # tick labels stand beyond the ends of equal axes
     figure.set_layout_engine("constrained", w_pad=0.12)
-    kinds = (("FFT", people.fft, people.rho_fft), ("Welch", people.welch, people.rho_welch))
-    for column, (title, spectra, rho) in zip(axes.T, kinds, strict=True):
+    for column, title, spectra, rho, style in (
+        (axes[:, 0], "FFT", people.fft, people.rho_fft, {"ms": 2.0, "alpha": 0.5}),
+        (axes[:, 1], "Welch", people.welch, people.rho_welch, {"ms": 4.0}),
+    ):
         for ax, (i, j), value in zip(column, people.pairs, rho, strict=True):
-            x, y = (np.asarray(spectra[k].power) / np.sum(spectra[k].power) for k in (i, j))
-            ax.loglog(
-                x,
-                y,
-                ".",
-                color=BLUE,
-                ms=2.0 if title == "FFT" else 4.0,
-                alpha=0.5 if title == "FFT" else 1.0,
-            )
-            ends = [min(x.min(), y.min()), max(x.max(), y.max())]
+            both = np.stack([spectra[i].proportional, spectra[j].proportional])
+            ends = [both.min(), both.max()]
+            ax.loglog(*both, ".", color=BLUE, **style)
             ax.plot(ends, ends, color=ink(), lw=0.6)
             ax.set_title(f"{title}: ρ = {value:.3f}", fontweight="normal")
             ax.set_aspect("equal", adjustable="datalim")
             _decades(ax, ends)
-            ax.set_xlabel(f"person {i + 1}")
-            ax.set_ylabel(f"person {j + 1}")
-    figure.suptitle(
-        f"{_source(people)}: {PROPORTIONAL.lower()} of two people", x=0.01, ha="left", fontsize=8
-    )
+            ax.set(xlabel=f"person {i + 1}", ylabel=f"person {j + 1}")
+    words = f"{_source(people)}: {PROPORTIONAL.lower()} of two people"
+    figure.suptitle(words, x=0.01, ha="left", fontsize=8)
     return figure
 
 
@@ -302,42 +201,38 @@ def _decades(ax: Axes, ends: list[float]) -> None:
         axis.set_ticks([], minor=True)
 
 
-@styled
-def readings(found: Reproduction) -> Figure:
-    """Force and proportional power of the three readings."""
-    return _readings(found.readings)
-
-
-def _readings(found: Iterable[Reading]) -> Figure:
-    shown = tuple(found)
-    figure, axes = _panels(len(shown), 2, height=1.45 * len(shown))
-    for (left, right), reading in zip(axes, shown, strict=True):
+def _readings(found: Sequence[Reading]) -> Figure:
+    """Force and proportional power of the readings."""
+    figure, axes = _panels(len(found), 2, height=1.45 * len(found))
+    for (left, right), reading in zip(axes, found, strict=True):
         percent = 100 * (reading.force / reading.force.mean() - 1)
         left.plot(WINDOW[0] + np.arange(percent.size) / 100, percent, color=BLUE, lw=0.5)
-        left.set_xlim(*WINDOW)
-        left.set_ylabel("Force (%)")
-        left.set_title(reading.key)
-        right.set_title("proportional", fontweight="normal")
-        p = np.asarray(reading.spectrum.power) / np.sum(reading.spectrum.power)
-        right.plot(reading.spectrum.frequency, p, color=BLUE, marker="o", ms=2.2, lw=1.0)
+        left.set(xlim=WINDOW, ylabel="Force (%)", title=reading.key)
+        spectrum = reading.spectrum
+        style: Style = {"color": BLUE, "marker": "o", "ms": 2.2, "lw": 1.0}
+        right.plot(spectrum.frequency, spectrum.proportional, **style)
         _stated(right)
-        right.set_xlim(0, 12)
-        right.set_ylim(bottom=0)
-        right.set_ylabel("Power")
+        right.set(xlim=(0, 12), ylim=(0, None), ylabel="Power")
+        right.set_title("proportional", fontweight="normal")
     axes[-1, 0].set_xlabel("Time (s)")
     axes[-1, 1].set_xlabel("Frequency (Hz)")
     return figure
 
 
 FIGURES: dict[str, Callable[[Reproduction], Figure]] = {
-    "fig2": fig2,
-    "fig3": fig3,
-    "fig4a": fig4a,
-    "fig4b": fig4b,
-    "fig5": fig5,
-    "fig6a": fig6a,
-    "fig6b": fig6b,
-    "fig7": fig7,
-    "fig8": fig8,
-    "readings": readings,
+    name: styled(make)
+    for name, make in {
+        "fig2": lambda r: _run(r.slifkin.force, FORCE, 6.0),
+        "fig3": lambda r: _spectrum(
+            r.slifkin.spectrum, BLUE, tuned=r.slifkin, ordinate="Power of the force (N²/Hz)"
+        ),
+        "fig4a": lambda r: _spectrum(r.slifkin.spectrum, BLUE, tuned=r.slifkin),
+        "fig4b": lambda r: _spectrum(r.slifkin.spectrum, BLUE, log=True, tuned=r.slifkin),
+        "fig5": lambda r: _run(r.slifkin.displacement, r"Displacement $x_\mathrm{z}$", 6.0),
+        "fig6a": lambda r: _run(r.hamilton.force, FORCE, 2.0),
+        "fig6b": lambda r: _spectrum(r.hamilton.moved, GREEN),
+        "fig7": lambda r: _fft_and_welch(r.experiment),
+        "fig8": lambda r: _pairs(r.experiment),
+        "readings": lambda r: _readings(r.readings),
+    }.items()
 }

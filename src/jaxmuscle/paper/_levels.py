@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.bundled import bundled_text
 from jaxmuscle._common.programs import kept
-from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._tasks import AbstractTask, Isometric
 from jaxmuscle.response._expected import response
 from jaxmuscle.response._scaling import at_level
@@ -19,11 +18,14 @@ from jaxmuscle.spectra._measures import approximate_entropy
 from jaxmuscle.spectra._settings import WINDOW
 from jaxmuscle.spectra._welch import Spectrum
 
-from ._readings import within_bins
+from ._readings import runs_of, within_bins
 
 LEVELS = np.array([0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95])
 STEADIEST, SMALLEST = 0.3, 0.017  # Taylor, Christou & Enoka 2003
 ENTROPY_SEEDS = 16
+
+
+PerLevel = Float[np.ndarray, " levels"]
 
 
 class Levels(eqx.Module):
@@ -37,9 +39,9 @@ class Levels(eqx.Module):
     %, and `at_35_moved`, the same muscle at 95 %.
     """
 
-    fractions: Float[np.ndarray, " levels"]
+    fractions: PerLevel
     power: Float[np.ndarray, "levels bins"]
-    variation: Float[np.ndarray, " levels"]
+    variation: PerLevel
     line: float
     within: float
     entropy: Float[np.ndarray, "levels seeds"]
@@ -47,7 +49,7 @@ class Levels(eqx.Module):
     at_35_moved: Spectrum
 
     @property
-    def maxima(self) -> Float[np.ndarray, " levels"]:
+    def maxima(self) -> PerLevel:
         """Frequency [Hz] of the largest absolute power at every level."""
         return self.at_35.settings.frequency[np.argmax(self.power, axis=1)]
 
@@ -56,12 +58,12 @@ class Levels(eqx.Module):
         return self.power / self.power.sum(1, keepdims=True)
 
     @property
-    def shifted(self) -> Float[np.ndarray, " levels"]:
+    def shifted(self) -> PerLevel:
         """Share of the power that is in other bins than at 95 % MVC."""
         return 0.5 * np.abs(self._proportional - self._proportional[-1]).sum(1)
 
     @property
-    def centroid(self) -> Float[np.ndarray, " levels"]:
+    def centroid(self) -> PerLevel:
         """Mean frequency [Hz] of the proportional power."""
         return self._proportional @ self.at_35.settings.frequency
 
@@ -72,10 +74,9 @@ class Levels(eqx.Module):
         top = int(np.argmax(self.entropy.mean(1)))
         if top in (0, len(self.entropy) - 1):
             return 0.0
-        rises = [self.entropy[top] - self.entropy[end] for end in (0, -1)]
-        return float(
-            min(np.mean(rise) / (np.std(rise, ddof=1) / np.sqrt(rise.size)) for rise in rises)
-        )
+        rises = self.entropy[top] - self.entropy[[0, -1]]
+        error = rises.std(axis=1, ddof=1) / np.sqrt(rises.shape[1])
+        return float(np.min(rises.mean(axis=1) / error))
 
 
 def fitted(level: int) -> AbstractTask:
@@ -85,7 +86,7 @@ def fitted(level: int) -> AbstractTask:
 
 
 @kept
-def _carried(
+def _carry(
     task: AbstractTask, fractions: Float[Array, " levels"], reference: Float[Array, ""]
 ) -> tuple[Array, Array]:
     """Power and coefficient of variation at every level."""
@@ -103,34 +104,31 @@ def levels() -> Levels:
     """The fit at 95 % at the levels of [30], 5 to 95 % MVC; and the fit at 35 %, there and at 95
     %."""
     high, low = fitted(95), fitted(35)
-    fractions = np.append(LEVELS, STEADIEST)
-    power, variation = (
-        np.asarray(v) for v in _carried(as_arrays(high), jnp.asarray(fractions), jnp.asarray(0.95))
-    )
-    entropy = np.array(
-        [_entropies(at_level(high, fraction, reference=0.95)) for fraction in LEVELS.tolist()]
-    )
+    power, variation = _carry_to(high, [*LEVELS, STEADIEST], 0.95)
+    entropy = [_entropies(at_level(high, fraction, reference=0.95)) for fraction in LEVELS.tolist()]
     louder = SMALLEST / variation[-1]  # to first order amplitudes and variation are proportional
-    beside, _ = _carried(
-        as_arrays(low), jnp.asarray(np.append(np.full(LEVELS.size, 0.35), 0.95)), jnp.asarray(0.35)
-    )
-    at_35, moved = (
-        Spectrum(low.settings.frequency, np.asarray(row), low.settings)
-        for row in (beside[0], beside[-1])
-    )
+    # as many levels as above, so that one program serves both
+    beside, _ = _carry_to(low, [0.35] * len(LEVELS) + [0.95], 0.35)
+    at_35, moved = (Spectrum(low.settings.frequency, row, low.settings) for row in beside[[0, -1]])
     return Levels(
         LEVELS,
         power[:-1] * louder**2,
         variation[:-1] * louder,
         float(high["harmonic_frequency"]),
         within_bins(high),
-        entropy,
+        np.array(entropy),
         at_35,
         moved,
     )
 
 
+def _carry_to(
+    task: AbstractTask, fractions: list[float], reference: float
+) -> tuple[np.ndarray, np.ndarray]:
+    found = _carry(as_arrays(task), jnp.asarray(fractions), jnp.asarray(reference))
+    return np.asarray(found[0]), np.asarray(found[1])
+
+
 def _entropies(task: AbstractTask) -> list[float]:
     """Approximate entropy of low-passed force, of every seed."""
-    runs = ensemble(task, jax.random.key(0), seeds=ENTROPY_SEEDS, control=False)
-    return [approximate_entropy(row) for row in runs.filtered()]
+    return [approximate_entropy(row) for row in runs_of(task, ENTROPY_SEEDS).filtered()]

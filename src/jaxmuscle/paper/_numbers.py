@@ -12,11 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle.data._recording import RECORDED, Recording
-from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._signals import SmoothStep
 from jaxmuscle.model._tasks import AbstractTask, PrescribedForce
 from jaxmuscle.model._white_noise import OrnsteinUhlenbeckNoise
-from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._presets import load_preset
 from jaxmuscle.simulation._trajectory import Trajectory, stack
 from jaxmuscle.spectra._measures import approximate_entropy, peaks, spearman
@@ -24,7 +22,18 @@ from jaxmuscle.spectra._settings import WINDOW
 from jaxmuscle.spectra._welch import Spectrum, lowpass
 
 from ._levels import Levels, levels
-from ._readings import HIGH_BIN, LOW_BIN, SILENT, Reading, fast_share, pulled, readings, within_bins
+from ._readings import (
+    HIGH_BIN,
+    LOW_BIN,
+    SILENT,
+    Reading,
+    expected_of,
+    fast_share,
+    in_task_2,
+    readings,
+    runs_of,
+    within_bins,
+)
 
 SEEDS = 32
 PERSON = ("k_w", "c_w", "noise_K_w", "harmonic_amplitude")
@@ -104,36 +113,30 @@ class Experiment(eqx.Module):
     @property
     def rho_fft(self) -> tuple[float, ...]:
         """Spearman correlation of the FFT power of each pair."""
-        return tuple(spearman(self.fft[i].power, self.fft[j].power) for i, j in self.pairs)
+        return tuple(spearman(a.power, b.power) for a, b in itertools.combinations(self.fft, 2))
 
     @property
     def rho_welch(self) -> tuple[float, ...]:
         """Spearman correlation of the Welch power of each pair."""
-        return tuple(spearman(self.welch[i].power, self.welch[j].power) for i, j in self.pairs)
+        return tuple(spearman(a.power, b.power) for a, b in itertools.combinations(self.welch, 2))
 
 
-def tuned(task: AbstractTask) -> Tuned:
+def run_preset(task: AbstractTask) -> Tuned:
     """A preset's force in Task 1, and its displacement in Task 2 under the force that it needs
     there."""
-    moments, _ = expected_moments(task, task.settings, WINDOW)
-    runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
-    second = pulled(task)
-    moved, _ = expected_moments(second, second.settings, WINDOW)
-    fast = np.mean([fast_share(row, runs.rate) for row in np.asarray(runs.between())])
+    moments, spectrum = expected_of(task)
+    runs, second = runs_of(task, SEEDS), in_task_2(task)
+    pulling, moved = expected_of(second)
     return Tuned(
         force=runs,
-        spectrum=Spectrum(
-            task.settings.frequency, np.asarray(moments.power), task.settings, task.output_unit
-        ),
+        spectrum=spectrum,
         sine=np.asarray(moments.line / moments.power),
         variation=float(moments.variation),
-        fast=float(fast),
+        fast=float(np.mean([fast_share(row, runs.rate) for row in np.asarray(runs.between())])),
         within=within_bins(task),
-        displacement=stack([ensemble(second, jax.random.key(0), seeds=1, control=False)], 1),
-        moved=Spectrum(
-            second.settings.frequency, np.asarray(moved.power), second.settings, second.output_unit
-        ),
-        displacement_variation=float(moved.variation),
+        displacement=stack([runs_of(second, 1)], 1),
+        moved=moved,
+        displacement_variation=float(pulling.variation),
         both=_both(runs),
         swing=_swing(runs),
     )
@@ -144,35 +147,22 @@ def concentric(task: AbstractTask) -> Concentric:
     harmonic."""
     way = SmoothStep(MOVED)
     moving = task.with_parts(x_z=way)
-    moments, _ = expected_moments(moving, moving.settings, WINDOW)
-    found = peaks(
-        Spectrum(
-            moving.settings.frequency,
-            np.asarray(moments.power),
-            moving.settings,
-            moving.output_unit,
-        )
-    )
+    moments, spectrum = expected_of(moving)
+    found = peaks(spectrum)
     high = max(found.local_maxima, key=lambda peak: peak.power, default=found.maximum)
-    back = ensemble(
-        pulled(moving, MOVED).replace(**SILENT), jax.random.key(0), seeds=1, control=False
-    )
+    back = runs_of(in_task_2(moving, MOVED).replace(**SILENT), 1)
     wanted = np.asarray(jax.vmap(way)(jnp.asarray(back.time)))
     error = np.abs(np.asarray(back.output)[0] - wanted).max() / MOVED
     return Concentric(float(moments.mean), found.maximum.frequency, high.frequency, float(error))
 
 
 def _both(runs: Trajectory) -> float:
-    spectra = runs.spectrum()
-    each = [
-        peaks(Spectrum(spectra.frequency, row, spectra.settings))
-        for row in np.asarray(spectra.power)
-    ]
-    return float(
-        np.mean(
-            [p.maximum.bin == LOW_BIN and HIGH_BIN in [q.bin for q in p.local_maxima] for p in each]
-        )
-    )
+    spectra, count = runs.spectrum(), 0
+    for row in np.asarray(spectra.power):
+        found = peaks(Spectrum(spectra.frequency, row, spectra.settings))
+        local = [peak.bin for peak in found.local_maxima]
+        count += found.maximum.bin == LOW_BIN and HIGH_BIN in local
+    return count / len(spectra.power)
 
 
 def _swing(runs: Trajectory) -> tuple[float, float]:
@@ -214,36 +204,27 @@ def person(number: int) -> AbstractTask:
     """
     task = PrescribedForce(P_w=5.0, noise=OrnsteinUhlenbeckNoise([0.05, 0.005, 0.0, 0.0], 0.1))
     factor = (0.9, 1.0, 1.1)[number]
-    return task.replace(
-        **{n: task[n] * (factor if i % 2 == 0 else 2 - factor) for i, n in enumerate(PERSON)}
-    )
+    # what rises with one person falls with another
+    factors = [factor, 2 - factor] * 2
+    return task.replace(**{n: task[n] * f for n, f in zip(PERSON, factors, strict=True)})
 
 
-def recorded(task: AbstractTask, seeds: int = 1, key: int = 100) -> tuple[Recording, ...]:
+def record(
+    task: AbstractTask, seeds: int = 1, key: int = 100, name: str = "run"
+) -> tuple[Recording, ...]:
     """60 s of x_z [m] at 120 Hz, after a rise of 5 s, as recordings."""
-    runs = ensemble(
-        task,
-        jax.random.key(key),
-        seeds=seeds,
-        duration=65.0,
-        dt=1 / 1200,
-        rate=120.0,
-        control=False,
-    )
-    rows = np.asarray(runs.between((5.0, 65.0)))
-    source = "simulated by jaxmuscle reproduce"
+    runs = runs_of(task, seeds, key, duration=65.0, dt=1 / 1200, rate=120.0)
+    about: dict[str, Any] = {"unit": "m", "source": "simulated by jaxmuscle reproduce"}
     return tuple(
-        Recording(row, 120.0, unit="m", name=f"run {i + 1}", source=source)
-        for i, row in enumerate(rows)
+        Recording(row, 120.0, name=f"{name} {i + 1}" if seeds > 1 else name, **about)
+        for i, row in enumerate(np.asarray(runs.between((5.0, 65.0))))
     )
 
 
 def simulated_recordings() -> tuple[Recording, ...]:
     """Three simulated people."""
-    found = [recorded(person(number), key=100 + number)[0] for number in range(3)]
     return tuple(
-        Recording(r.whole, r.rate, unit=r.unit, name=f"simulated person {i + 1}", source=r.source)
-        for i, r in enumerate(found)
+        record(person(i), key=100 + i, name=f"simulated person {i + 1}")[0] for i in range(3)
     )
 
 
@@ -254,20 +235,20 @@ def given_recordings(
     the same bins."""
     from jaxmuscle.data._recording_files import load_recording
 
-    if isinstance(recordings, str | os.PathLike) or len(recordings) != 3:
-        count = 1 if isinstance(recordings, str | os.PathLike) else len(recordings)
+    if isinstance(recordings, str | os.PathLike):
+        recordings = [recordings]
+    if len(recordings) != 3:
         raise ValueError(
-            f"recordings: {count} given, three are compared: give one for each of three people"
+            f"recordings: {len(recordings)} given, three are compared: give one for each of three"
+            " people"
         )
     loaded = [r if isinstance(r, Recording) else load_recording(r) for r in recordings]
-    quantities = [r.quantity for r in loaded]
+    quantities = [str(r.quantity) for r in loaded]
     if len(set(quantities)) > 1:
-        raise ValueError(
-            f"recordings of {', '.join(str(q) for q in quantities)}: give three of the same"
-            " quantity"
-        )
+        raise ValueError(f"recordings of {', '.join(quantities)}: give three of the same quantity")
     shortest = min(r.duration for r in loaded)
-    return tuple(r.steady((float(r.time[0]), float(r.time[0]) + shortest)) for r in loaded)
+    begins = [float(r.time[0]) for r in loaded]
+    return tuple(r.steady((t, t + shortest)) for r, t in zip(loaded, begins, strict=True))
 
 
 def experiment(given: tuple[Recording, ...] | None = None) -> Experiment:
@@ -294,15 +275,15 @@ class Reproduction(eqx.Module):
     readings: tuple[Reading, ...]
 
 
-def computed(
+def compute(
     given: tuple[Recording, ...] | None = None, report: Progress = lambda text, share: None
 ) -> Reproduction:
     """All numbers, in float64; nothing is written."""
     with jax.enable_x64(True):
         report("Task 1 and 2, zagrodny-slifkin", 0.0)
-        slifkin = tuned(load_preset("zagrodny-slifkin"))
+        slifkin = run_preset(load_preset("zagrodny-slifkin"))
         report("Task 1 and 2, zagrodny-hamilton", 0.15)
-        hamilton = tuned(load_preset("zagrodny-hamilton"))
+        hamilton = run_preset(load_preset("zagrodny-hamilton"))
         moving = concentric(slifkin.force.task)
         report("levels of contraction", 0.3)
         moved = levels()
@@ -310,7 +291,7 @@ def computed(
         compared = regularity(slifkin.force)
         report("three people", 0.5)
         people = experiment(given)
-        tuned_runs = experiment(recorded(slifkin.displacement.task, seeds=3))
+        tuned_runs = experiment(record(slifkin.displacement.task, seeds=3))
         report("three readings", 0.6)
         judged = readings(slifkin.force.task)
         return Reproduction(slifkin, hamilton, moving, moved, compared, people, tuned_runs, judged)

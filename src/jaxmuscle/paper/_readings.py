@@ -1,6 +1,8 @@
 """Three readings of the 0.391 Hz and 4.251 Hz maxima: which of the facts that the paper states does
 each of them give?"""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -12,7 +14,9 @@ from jaxmuscle.model._parameters import CHANNELS
 from jaxmuscle.model._signals import Harmonic, Sampled
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, PrescribedMotion
 from jaxmuscle.model._white_noise import BandLimitedNoise
+from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._expected_moments import expected_moments
+from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._measures import peaks
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum
@@ -27,6 +31,16 @@ SILENT = {f"noise_{channel}": 0.0 for channel in CHANNELS} | {"harmonic_amplitud
 PAPER_NOISE = [0.0016, 0.0016, 0.0001, 0.0001]
 SEEDS = 16
 
+Times = Float[np.ndarray, " times"]
+CONCLUSION = (
+    "{first} all that is stated. A lacks: {A}. B lacks: {B}. In Task 1 there is no resonance at"
+    " all: with x_z prescribed x_w obeys one equation of first order, so white noise gives P_w the"
+    " density (a + bω² + cω⁴)/(ω² + p²), which has a minimum at most, never a local maximum; there"
+    " the local maximum can only be the harmonic. C puts all power into bin 1 and leaves no local"
+    " maximum of 1 %, and its force holds no sine. So A is the reading of the figures of Task 1,"
+    " with the 4.25 Hz sine as the slow one beside noise that reaches 50 Hz; if the text of Figure"
+    " 2 means the lower frequency, only B has that sine, and then the force is not that of Task 1."
+)
 FACTS = {
     "low": "maximum of proportional force power in bin 1 (0.391 Hz)",
     "high": "one local maximum of at least 1 % of it, in bin 11 (4.297 Hz)",
@@ -37,11 +51,23 @@ FACTS = {
 }
 
 
-def fast_share(samples: Float[np.ndarray, " times"], rate: float) -> float:
+def fast_share(samples: Times, rate: float) -> float:
     """Share of a signal's variance above 10 Hz, up to half the sampling rate (nothing is
     filtered)."""
     power = np.abs(np.fft.rfft(samples - samples.mean())) ** 2
     return float(power[np.fft.rfftfreq(samples.size, 1 / rate) > FAST].sum() / power.sum())
+
+
+def runs_of(task: AbstractTask, seeds: int = SEEDS, key: int = 0, **options: Any) -> Trajectory:
+    """A task's output from so many seeds."""
+    return ensemble(task, jax.random.key(key), seeds=seeds, control=False, **options)
+
+
+def expected_of(task: AbstractTask) -> tuple[Moments, Spectrum]:
+    """The moments of a task's output in the window, and its expected spectrum."""
+    moments, _ = expected_moments(task, task.settings, WINDOW)
+    power = np.asarray(moments.power)
+    return moments, Spectrum(task.settings.frequency, power, task.settings, task.output_unit)
 
 
 def within_bins(task: AbstractTask) -> float:
@@ -64,7 +90,7 @@ class Reading(eqx.Module):
     key: str
     words: str
     task: AbstractTask
-    force: Float[np.ndarray, " times"]
+    force: Times
     spectrum: Spectrum
     displacement: Spectrum
     sine_share: float
@@ -77,7 +103,7 @@ class Reading(eqx.Module):
         return tuple(FACTS[key] for key, holds in self.facts.items() if not holds)
 
 
-def pulled(task: AbstractTask, x_z: float = HELD) -> AbstractTask:
+def in_task_2(task: AbstractTask, x_z: float = HELD) -> AbstractTask:
     """The same muscle in Task 2, constant forces from 5 s on.
 
     For Task 1 the P_w(t) that it needs, without noise and harmonic, to hold the insertion at `x_z`
@@ -86,7 +112,7 @@ def pulled(task: AbstractTask, x_z: float = HELD) -> AbstractTask:
     """
     if not isinstance(task, PrescribedMotion):
         return task.as_task(PrescribedForce, P_w=float(task["P_w"]))
-    needed = ensemble(task.replace(x_z=x_z, **SILENT), jax.random.key(0), seeds=1, control=False)
+    needed = runs_of(task.replace(x_z=x_z, **SILENT), 1)
     force = Sampled.through(needed.time, np.asarray(needed.output)[0])
     return task.as_task(PrescribedForce, P_w=force, F_ext=task.F_ext)
 
@@ -103,106 +129,49 @@ def resonant() -> AbstractTask:
 def readings(preset: AbstractTask) -> tuple[Reading, ...]:
     """A, B (as it is and in Task 1), C (leakage of the mean, slow transient) about the preset of
     Figures 2 to 5."""
-    pwelch = SpectrumSettings.pwelch()
+    isometric = "a harmonic at 0.391 Hz, a resonance near 4.25 Hz (isometric: two states)"
+    leaking = "no slow part; the mean leaks into bin 1 (pwelch: Hamming, no detrend)"
+    slow, pwelch = "a transient slower than the window, mean removed", SpectrumSettings.pwelch()
+    held = preset.replace(harmonic_frequency=LOW)
     return (
-        _stationary("A", "a harmonic at 4.25 Hz on slow relaxation", preset),
-        _stationary(
-            "B",
-            "a harmonic at 0.391 Hz, a resonance near 4.25 Hz (isometric: two states)",
-            resonant(),
-        ),
-        _stationary(
-            "B1",
-            "the same in Task 1, whose one state cannot resonate",
-            preset.replace(harmonic_frequency=LOW),
-        ),
-        _simulated(
-            "C1",
-            "no slow part; the mean leaks into bin 1 (pwelch: Hamming, no detrend)",
-            preset.replace(c_z=5.0),
-            pwelch,
-        ),
-        _simulated(
-            "C2",
-            "a transient slower than the window, mean removed",
-            preset.replace(c_z=1000.0),
-            preset.settings,
-        ),
+        _judge("A", "a harmonic at 4.25 Hz on slow relaxation", preset),
+        _judge("B", isometric, resonant()),
+        _judge("B1", "the same in Task 1, whose one state cannot resonate", held),
+        # neither a mean that leaks nor a transient has an expected spectrum
+        _judge("C1", leaking, preset.replace(c_z=5.0), pwelch),
+        _judge("C2", slow, preset.replace(c_z=1000.0), preset.settings),
     )
 
 
-def _stationary(key: str, words: str, task: AbstractTask) -> Reading:
-    """By the expected spectrum; the time series from one seed."""
-    moments, _ = expected_moments(task, task.settings, WINDOW)
-    runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
-    return _judged(
-        key,
-        words,
-        task,
-        np.asarray(runs.between())[0],
-        _spectrum(task, moments.power),
-        _sine(moments),
-    )
-
-
-def _simulated(key: str, words: str, task: AbstractTask, settings: SpectrumSettings) -> Reading:
-    """By the mean spectrum of 16 seeds: neither a mean that leaks nor a transient has an expected
-    spectrum."""
-    runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
-    moments, _ = expected_moments(task, settings, WINDOW)
-    mean = runs.spectrum(settings).mean()
-    spectrum = Spectrum(settings.frequency, np.asarray(mean.power), settings, mean.unit)
-    sine = float(moments.line[0] / spectrum.power[0])
-    return _judged(key, words, task, np.asarray(runs.between())[0], spectrum, sine)
-
-
-def _judged(
-    key: str,
-    words: str,
-    task: AbstractTask,
-    force: Float[np.ndarray, " times"],
-    spectrum: Spectrum,
-    sine: float,
+def _judge(
+    key: str, words: str, task: AbstractTask, simulated: SpectrumSettings | None = None
 ) -> Reading:
-    second = pulled(task)
-    moments, _ = expected_moments(second, second.settings, WINDOW)
-    displacement = _spectrum(second, moments.power)
-    found, moved, fast = peaks(spectrum), peaks(displacement), fast_share(force, task.settings.rate)
+    """By the expected spectrum, or by the mean one of 16 seeds with these settings; the time series
+    from one seed."""
+    runs = runs_of(task)
+    moments, spectrum = expected_of(task)
+    if simulated is not None:
+        moments, _ = expected_moments(task, simulated, WINDOW)
+        mean = runs.spectrum(simulated).mean()
+        spectrum = Spectrum(simulated.frequency, np.asarray(mean.power), simulated, mean.unit)
+    sine, force = float(moments.line[0] / spectrum.power[0]), np.asarray(runs.between())[0]
+    pulling, displacement = expected_of(in_task_2(task))
+    found, fast = peaks(spectrum), fast_share(force, task.settings.rate)
+    oscillates = peaks(displacement).local_maxima or pulling.line[0] / pulling.power[0] >= LINE
     facts = {
         "low": found.maximum.bin == LOW_BIN,
         "high": [peak.bin for peak in found.local_maxima] == [HIGH_BIN],
         "sine": sine >= LINE,
         "fast": fast >= FAST_SHARE,
-        "displacement": bool(moved.local_maxima) or _sine(moments) >= LINE,
+        "displacement": bool(oscillates),
         "task": isinstance(task, PrescribedMotion),
     }
     return Reading(key, words, task, force, spectrum, displacement, sine, fast, facts)
 
 
-def _sine(moments) -> float:
-    return float(moments.line[0] / moments.power[0])
-
-
-def _spectrum(task: AbstractTask, power) -> Spectrum:
-    return Spectrum(task.settings.frequency, np.asarray(power), task.settings, task.output_unit)
-
-
 def conclusion(found: tuple[Reading, ...]) -> str:
     """Which reading reproduces all that is stated, in a few sentences."""
-    complete = [r.key for r in found if not r.missing]
-    by = {r.key: r for r in found}
-    if complete:
-        first = f"Reading {' and '.join(complete)} gives all that is stated."
-    else:
-        first = "No reading gives all that is stated."
-    lacking = {key: "; ".join(by[key].missing) for key in ("A", "B")}
-    return (
-        f"{first} A lacks: {lacking['A'] or 'nothing'}. B lacks: {lacking['B'] or 'nothing'}. In"
-        " Task 1 there is no resonance at all: with x_z prescribed x_w obeys one equation of first"
-        " order, so white noise gives P_w the density (a + bω² + cω⁴)/(ω² + p²), which has a"
-        " minimum at most, never a local maximum; there the local maximum can only be the"
-        " harmonic. C puts all power into bin 1 and leaves no local maximum of 1 %, and its force"
-        " holds no sine. So A is the reading of the figures of Task 1, with the 4.25 Hz sine as"
-        " the slow one beside noise that reaches 50 Hz; if the text of Figure 2 means the lower"
-        " frequency, only B has that sine, and then the force is not that of Task 1."
-    )
+    complete = " and ".join(r.key for r in found if not r.missing)
+    first = f"Reading {complete} gives" if complete else "No reading gives"
+    lacking = {r.key: "; ".join(r.missing) or "nothing" for r in found}
+    return CONCLUSION.format(first=first, **lacking)

@@ -8,7 +8,7 @@ import jax
 
 from jaxmuscle.data._recording import Recording
 
-from ._numbers import Progress, Reproduction, computed, given_recordings
+from ._numbers import Reproduction, compute, given_recordings
 
 
 def reproduce(
@@ -41,16 +41,10 @@ def reproduce(
 
     given = None if recordings is None else given_recordings(recordings)
     with told(progress, "reproduce") as report:
-        return _written(Path(out), given, report, draw, check, write_page)
-
-
-def _written(
-    out: Path, given: tuple[Recording, ...] | None, report: Progress, draw, check, write_page
-) -> Reproduction:
-    found = computed(given, report)
-    report("figures", 0.8)
-    with jax.enable_x64(True):
-        draw(found, out)
-        write_page(found, check(found), out)
-    report("done", 1.0)
+        found = compute(given, report)
+        report("figures", 0.8)
+        with jax.enable_x64(True):
+            draw(found, Path(out))
+            write_page(found, check(found), Path(out))
+        report("done", 1.0)
     return found

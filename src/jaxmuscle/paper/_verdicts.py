@@ -2,20 +2,16 @@
 worth."""
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 from ._numbers import Reproduction
 
 Verdict = Literal["agrees", "agrees within our resolution", "does not agree", "cannot be checked"]
-AGREES, GRID, DIFFERS, UNCHECKED = (
-    "agrees",
-    "agrees within our resolution",
-    "does not agree",
-    "cannot be checked",
-)
+AGREES, GRID, DIFFERS, UNCHECKED = get_args(Verdict)
 Kind = Literal["tests the model", "fitted", "put in", "arithmetic"]
-TESTED, FITTED, GIVEN, ARITHMETIC = "tests the model", "fitted", "put in", "arithmetic"
+TESTED, FITTED, GIVEN, ARITHMETIC = get_args(Kind)
 KINDS: dict[Kind, str] = {
     TESTED: (
         "Nothing of it was put in, so it could have come out otherwise. Only these count for the"
@@ -67,24 +63,22 @@ class Row(NamedTuple):
     why: str
 
 
-def checked(claim: Claim, found: Reproduction) -> Row:
+def check_claim(claim: Claim, found: Reproduction) -> Row:
     """A claim with its numbers and its verdict."""
-    numbers = tuple(float(x) for x in claim.numbers(found))
+    numbers = tuple(map(float, claim.numbers(found)))
     verdict = claim.rule(*numbers)
-    why = "" if verdict == AGREES else claim.why.format(*numbers)
     ours = re.sub(r"(?<=\d)%", " %", claim.words.format(*numbers))
-    return Row(
-        claim.key, claim.kind, claim.source, claim.says, ours, numbers, claim.how, verdict, why
-    )
+    why = "" if verdict == AGREES else claim.why.format(*numbers)
+    return Row(*claim[:4], ours, numbers, claim.how, verdict, why)
 
 
 def counted(rows: Iterable[Row]) -> str:
     """How many statements there are, how many test the model, and what came of them, in one
     sentence."""
     rows = tuple(rows)
-    tests = [row for row in rows if row.kind == TESTED]
-    others = [(kind, [row for row in rows if row.kind == kind]) for kind in KINDS if kind != TESTED]
-    beside = ", ".join(f"{len(some)} {kind}{_failed(some)}" for kind, some in others)
+    of: dict[Kind, list[Row]] = {kind: [row for row in rows if row.kind == kind] for kind in KINDS}
+    tests = of.pop(TESTED)
+    beside = ", ".join(f"{len(some)} {kind}{_failed(some)}" for kind, some in of.items())
     return (
         f"Of {len(rows)} statements {len(tests)} test the model: {outcome(tests)}. Not counted for"
         f" it: {beside}."
@@ -93,24 +87,18 @@ def counted(rows: Iterable[Row]) -> str:
 
 def outcome(rows: Iterable[Row]) -> str:
     """How many agree, how many do not, how many cannot be checked."""
-    verdicts = [row.verdict for row in rows]
-    agree, within, differ = (
-        sum(v in (AGREES, GRID) for v in verdicts),
-        verdicts.count(GRID),
-        verdicts.count(DIFFERS),
-    )
-    told = f"{agree} {'agrees' if agree == 1 else 'agree'}" + (
-        f" ({within} within our resolution)" if within else ""
-    )
+    count = Counter(row.verdict for row in rows)
+    agree, within, differ = count[AGREES] + count[GRID], count[GRID], count[DIFFERS]
+    resolved = f" ({within} within our resolution)" * bool(within)
     return (
-        f"{told}, {differ} {'does' if differ == 1 else 'do'} not, {verdicts.count(UNCHECKED)}"
-        " cannot be checked"
+        f"{agree} {'agrees' if agree == 1 else 'agree'}{resolved}, {differ}"
+        f" {'does' if differ == 1 else 'do'} not, {count[UNCHECKED]} cannot be checked"
     )
 
 
 def _failed(rows: Iterable[Row]) -> str:
     count = sum(row.verdict == DIFFERS for row in rows)
-    return f" ({count} of them not met)" if count else ""
+    return f" ({count} of them not met)" * bool(count)
 
 
 def holds(condition: Callable[..., bool], otherwise: Verdict = DIFFERS) -> Callable[..., Verdict]:

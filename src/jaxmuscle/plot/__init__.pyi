@@ -11,7 +11,6 @@ from ._coverage import coverage as coverage
 from ._designed_input import designed_input as designed_input
 from ._fit import fit as fit
 from ._identifiability import identifiability as identifiability
-from ._moments import moments as moments
 from ._perturbed import frequency_response as frequency_response
 from ._perturbed import perturbed as perturbed
 from ._posterior import chains as chains
@@ -23,6 +22,7 @@ from ._recording import recording as recording
 from ._recording import trials as trials
 from ._schematic import schematic as schematic
 from ._sensitivity import sensitivity as sensitivity
+from ._simulation import moments as moments
 from ._simulation import simulation as simulation
 from ._simulation import trajectory as trajectory
 from ._spectra import QUANTILES as QUANTILES

@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from ._style import BLUE, COLUMN, GREEN, GREY, VERMILLION, canvas, fitted_to, key, styled
+from ._style import BLUE, GREEN, GREY, VERMILLION, finish, panels, styled
 
 HEIGHTS = 1.7, 1.7  # inches
 TISSUES = (("w", BLUE, "active tissue", 3.0), ("z", VERMILLION, "passive tissue", 1.5))
+OF_TISSUE = "K_{}", "K_{}_tangent", "C_{}", "x_{}"
 
 
 @styled
@@ -28,44 +29,29 @@ def static(curves: Any, ax: Any = None) -> tuple[Axes, Axes, Axes]:
         raise ValueError(
             f"ax has {len(ax)} axes: give three, for K(x), C(v) and force against displacement"
         )
-    stiffness, damping, force = _places(canvas(None, (COLUMN, sum(HEIGHTS)))) if ax is None else ax
+    figure, axes = (None, ax) if ax is not None else panels(None, "AB;CC", HEIGHTS)
+    stiffness, damping, force = axes
     _coefficients(curves, stiffness, damping)
     _forces(curves, force)
-    if ax is None:
-        fitted_to(force.figure, sum(HEIGHTS), key(force.figure))
-    else:
-        for panel in (stiffness, damping, force):
+    if figure is None:
+        for panel in axes:
             panel.legend(loc="best")
+    else:
+        finish(figure, HEIGHTS)
     return stiffness, damping, force
-
-
-def _places(fig: Any) -> tuple[Axes, ...]:
-    """Both coefficients beside each other, the forces below."""
-    grid = fig.add_gridspec(2, 2, height_ratios=HEIGHTS)
-    return tuple(fig.add_subplot(grid[place]) for place in ((0, 0), (0, 1), (1, slice(None))))
 
 
 def _coefficients(curves: Any, stiffness: Axes, damping: Axes) -> None:
     x = 1e3 * curves.displacement
     for j, colour, tissue, width in TISSUES:
-        stiffness.plot(x, getattr(curves, f"K_{j}"), color=colour, lw=width, label=tissue)
+        K, tangent, C, place = (getattr(curves, name.format(j)) for name in OF_TISSUE)
+        stiffness.plot(x, K, color=colour, lw=width, label=tissue)
         slope = rf"slope of its spring, d$F_\mathrm{{{j}}}$/d$x$"
-        stiffness.plot(
-            x, getattr(curves, f"K_{j}_tangent"), color=colour, lw=0.7 * width, ls="--", label=slope
-        )
-        damping.plot(
-            curves.velocity, getattr(curves, f"C_{j}"), color=colour, lw=width, label=tissue
-        )
-        place = getattr(curves, f"x_{j}")
+        stiffness.plot(x, tangent, color=colour, lw=0.7 * width, ls="--", label=slope)
+        damping.plot(curves.velocity, C, color=colour, lw=width, label=tissue)
         if np.isfinite(place):
-            stiffness.axvline(
-                1e3 * place,
-                color=colour,
-                lw=0.8,
-                ls=":",
-                label=rf"$x_\mathrm{{{j}}}$ of the task",
-                zorder=1,
-            )
+            label = rf"$x_\mathrm{{{j}}}$ of the task"
+            stiffness.axvline(1e3 * place, color=colour, lw=0.8, ls=":", label=label, zorder=1)
     for panel in (stiffness, damping):
         panel.set_ylim(bottom=min(panel.get_ylim()[0], 0.0), auto=None)
     stiffness.set(title="Stiffness K(x)", xlabel="Displacement (mm)", ylabel="Stiffness (N/m)")

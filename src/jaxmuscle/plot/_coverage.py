@@ -8,7 +8,7 @@ import numpy as np
 import scipy.stats
 from matplotlib.axes import Axes
 
-from ._style import COLUMN, GREY, PALETTE, canvas, fitted_to, ink, key, named, shade, styled
+from ._style import GREY, PALETTE, canvas, finish, ink, shade, shorten, styled
 
 HEIGHT = 3.0  # inches
 FINE = np.linspace(0.0, 1.0, 401)
@@ -63,7 +63,7 @@ def coverage(
     if not 0 < level < 1:
         raise ValueError(f"level = {level!r} must lie between 0 and 1: 0.95 is usual")
     own = ax is None
-    ax = canvas(None, (COLUMN, HEIGHT)).add_subplot() if ax is None else ax
+    ax = canvas(None, [HEIGHT]).add_subplot() if ax is None else ax
     fewest = min(map(len, held.values()))
     low, high = (
         scipy.stats.binom.ppf(0.5 + side * level / 2, fewest, FINE) / fewest for side in (-1, 1)
@@ -74,31 +74,21 @@ def coverage(
         [0, 1], [0, 1], color=ink() if len(held) > 1 else GREY, lw=0.8, zorder=1, label="calibrated"
     )
     for number, (name, each) in enumerate(held.items()):
-        style: dict[str, Any] = {
-            "color": PALETTE[number % len(PALETTE)],
-            "ls": DASHES[number // len(PALETTE) % len(DASHES)],
-        }
+        again, colour = divmod(number, len(PALETTE))
         share = np.searchsorted(each, FINE, side="right") / len(each)
-        # equal curves lie upon each other: the lower one has an edge
-        width = 1.0 + 1.6 * (1 - (number + 1) / len(held))
-        ax.step(
-            FINE,
-            share,
-            where="post",
-            lw=width,
-            zorder=3,
-            label=named(name.replace("_", " "), 30),
-            **style,
-        )
-    ax.set(
-        xlim=(0, 1),
-        ylim=(0, 1),
-        xlabel="Credibility α of the interval",
-        ylabel="Share that holds the truth",
-    )
+        style: dict[str, Any] = {
+            "color": PALETTE[colour],
+            "ls": DASHES[again % len(DASHES)],
+            # equal curves lie upon each other: the lower one has an edge
+            "lw": 1.0 + 1.6 * (1 - (number + 1) / len(held)),
+        }
+        label = shorten(name.replace("_", " "), 30)
+        ax.step(FINE, share, where="post", zorder=3, label=label, **style)
+    ax.set(xlim=(0, 1), ylim=(0, 1))
+    ax.set(xlabel="Credibility α of the interval", ylabel="Share that holds the truth")
     ax.set_aspect("equal", adjustable="box")
     if own:
-        fitted_to(ax.figure, HEIGHT, key(ax.figure))
+        finish(ax.figure, [HEIGHT])
     else:
         ax.legend(loc="upper left")
     return ax

@@ -4,9 +4,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
 
-from ._style import BLUE, COLUMN, GREY, ORANGE, canvas, fitted_to, key, log_axis, shade, styled
+from ._style import BLUE, GREY, ORANGE, AnyFigure, finish, log_axis, panels, shade, styled
 
 SHOWN = 20.0  # s
 HEIGHTS, ROW = (1.7, 1.5), 0.2  # inches
@@ -15,7 +14,7 @@ NOW, FLAT, DESIGNED = "now, without this record", "flat motion", "designed motio
 
 
 @styled
-def designed_input(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
+def designed_input(found: Any, ax: Axes | None = None) -> AnyFigure:
     """Draws a designed motion: its density, its beginning, and the standard errors that are
     expected with it.
 
@@ -24,10 +23,13 @@ def designed_input(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     error that was asked for. Errors are in percent of the value, of one record. Letters are legible
     in a column of 85 mm.
     """
-    heights = HEIGHTS[0], HEIGHTS[1], 0.75 + ROW * len(found.told)
-    fig = canvas(ax, (COLUMN, sum(heights)))
-    density, motion, errors = fig.subplots(3, 1, height_ratios=heights)
-    _density(density, found)
+    heights = *HEIGHTS, 0.75 + ROW * len(found.names)
+    fig, (density, motion, errors) = panels(ax, "A;B;C", heights)
+    name = DESIGNED if found.moves else FLAT
+    # lines of a motion, what is known with it, and how they are drawn
+    motions = [(found.even, found.flat, GREY, "s", FLAT)] * bool(found.moves)
+    motions += [(found.lengthening, found.stderr, BLUE, "o", name)]
+    _density(density, found, motions)
     shown = found.time <= SHOWN
     motion.plot(found.time[shown], 1e3 * found.displacement[shown], color=BLUE, lw=0.9)
     motion.axhline(0, color=GREY, lw=0.5)
@@ -35,31 +37,17 @@ def designed_input(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
         xlabel="Time (s)",
         ylabel="Lengthening (mm)",
         xlim=(0, min(SHOWN, found.lengthening.seconds)),
+        title=name.capitalize() + f", its first {SHOWN:g} s" * bool(found.time[-1] > SHOWN),
     )
-    name = _label(found).capitalize()
-    motion.set_title(f"{name}, its first {SHOWN:g} s" if found.time[-1] > SHOWN else name)
-    _errors(errors, found)
+    _errors(errors, found, [(None, found.now, ORANGE, "D", NOW), *motions])
     fig.align_ylabels([density, motion])
-    fitted_to(fig, sum(heights), key(fig, 3))
-    return fig
+    return finish(fig, heights, columns=3)
 
 
-def _label(found: Any) -> str:
-    return DESIGNED if found.moves else FLAT
-
-
-def _density(ax: Axes, found: Any) -> None:
-    for lines, colour, label in [(found.even, GREY, FLAT)] * bool(found.moves) + [
-        (found.lengthening, BLUE, _label(found))
-    ]:
-        ax.step(
-            found.frequency,
-            1e6 * lines.power * lines.seconds,
-            where="mid",
-            color=colour,
-            lw=1.2,
-            label=label,
-        )
+def _density(ax: Axes, found: Any, motions: list[Any]) -> None:
+    for lines, _, colour, _, label in motions:
+        density = 1e6 * lines.power * lines.seconds
+        ax.step(found.frequency, density, where="mid", color=colour, lw=1.2, label=label)
     log_axis(ax)
     low, high = ax.dataLim.intervaly
     if high < LEAST * low:
@@ -68,15 +56,10 @@ def _density(ax: Axes, found: Any) -> None:
     ax.set(xlabel="Frequency (Hz)", ylabel="Density (mm²/Hz)", title="Motion of the insertion")
 
 
-def _errors(ax: Axes, found: Any) -> None:
+def _errors(ax: Axes, found: Any, ways: list[Any]) -> None:
     """A row for each quantity, a mark for each way to measure it."""
-    names = found.told
-    flat = [(found.flat, GREY, "s", FLAT)] * bool(found.moves)
-    for known, colour, marker, label in [
-        (found.now, ORANGE, "D", NOW),
-        *flat,
-        (found.stderr, BLUE, "o", _label(found)),
-    ]:
+    names = found.names
+    for _, known, colour, marker, label in ways:
         size = [found.percent(name, known) for name in names]
         ax.plot(size, np.arange(len(names)), marker, ms=4.5, color=colour, label=label, zorder=3)
     if found.needed is not None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
 
 from jaxmuscle._common.text import probability
 
@@ -17,30 +16,33 @@ from ._spectra import target
 from ._stiffness import gain, phase, stiffness_residuals
 from ._style import (
     BLUE,
-    COLUMN,
     GREEN,
     GREY,
     ORANGE,
+    PER_BIN,
     VERMILLION,
+    AnyFigure,
+    Style,
     canvas,
-    fitted_to,
-    heading,
+    finish,
     ink,
-    key,
     log_axis,
-    named,
     output_label,
     shade,
+    shade_deviations,
+    shorten,
     styled,
     without_legend,
 )
 
+Panel = Callable[[Axes], Any]
+Row = tuple[float, tuple[Panel, ...]]  # height [inches]
 ALLOWED = 3.84  # 95 % quantile of χ² with one degree of freedom
 DARK_GREEN = "#00664A"  # the palette's green is too light for small letters
 
 
 @styled
-def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
+def fit(result: Any, ax: Axes | None = None) -> AnyFigure:
     """Draws what a fit found: spectra linear and logarithmic, residuals, simulated output, the
     harmonic's profile.
 
@@ -54,91 +56,57 @@ def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """
     panels = _panels(result)
     heights = [height for height, _ in panels]
-    fig = canvas(ax, (COLUMN, sum(heights)), w_pad=0.05, h_pad=0.04)
+    fig = canvas(ax, heights, w_pad=0.05, h_pad=0.04)
     grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
     for row, (_, draw) in enumerate(panels):
         for column, panel in enumerate(draw):
             panel(fig.add_subplot(grid[row, column] if len(draw) > 1 else grid[row, :]))
-    fitted_to(fig, sum(heights), _title(fig, result) + key(fig))
-    return fig
-
-
-def _title(fig: Figure | SubFigure, result: Any) -> int:
-    """The target's name, and in red whatever forbids to believe the fit; how many lines."""
-    name = ", ".join(result.parts) if len(result.parts) > 1 else result.target.name
-    name = named(name, 50)
-    if any(part.target.provenance == "reconstructed" for part in result.parts.values()):
+    # in red whatever forbids to believe the fit
+    bad = "Does not describe the data" if result.adequate is False else ""
+    parts, name = result.parts.values(), shorten(", ".join(result.parts), 50)
+    if len(parts) == 1:
+        name = shorten(result.target.name, 50)
+    if any(part.target.provenance == "reconstructed" for part in parts):
         name += " (reconstructed)"
-    bad = (
-        "Not fitted"
-        if not result.success
-        else "Does not describe the data"
-        if result.adequate is False
-        else ""
-    )
-    return heading(fig, name, bad=bad)
+    return finish(fig, heights, name, bad=bad if result.success else "Not fitted")
 
 
-Panel = Callable[[Axes], None]
-
-
-def _panels(result: Any) -> list[tuple[float, tuple[Panel, ...]]]:
+def _panels(result: Any) -> list[Row]:
     """Rows of panels with their heights: of one target in full, of several one row each."""
-    parts = result.parts
-    if len(parts) > 1:
-        rows: list[tuple[float, tuple[Panel, ...]]] = [
-            (
-                1.7,
-                (
-                    partial(
-                        _spectra, part=part, log=True, title=f"{name}: {type(part.task).__name__}"
-                    ),
-                    partial(_residuals, part=part),
-                ),
-            )
-            for name, part in parts.items()
-            if part.fitted.size
-        ]
-        return rows + [
-            row
-            for name, part in parts.items()
-            for row in _moved(part, f"{name}: dynamic stiffness")
-        ]
+    rows: list[Row] = []
+    if len(result.parts) > 1:
+        for name, part in result.parts.items():
+            title = f"{name}: {type(part.task).__name__}"
+            spectra = partial(_spectra, part=part, log=True, title=title)
+            rows += [(1.7, (spectra, partial(_residuals, part=part)))] * bool(part.fitted.size)
+        for name, part in result.parts.items():
+            rows += _moved(part, f"{name}: dynamic stiffness")
+        return rows
     part = result.only
-    rows = (
-        [
-            (
-                1.75,
-                (partial(_spectra, part=part, log=False), partial(_spectra, part=part, log=True)),
-            ),
+    if part.fitted.size:
+        verdict, relative = (result.closeness, result.adequacy_p), bool(result.per_newton)
+        rows += [
+            (1.75, tuple(partial(_spectra, part=part, log=log) for log in (False, True))),
             (
                 1.4,
                 (
-                    partial(_residuals, part=part, verdict=(result.closeness, result.adequacy_p)),
-                    partial(_stretch, part=part, relative=bool(result.per_newton)),
+                    partial(_residuals, part=part, verdict=verdict),
+                    partial(_stretch, part=part, relative=relative),
                 ),
             ),
         ]
-        if part.fitted.size
-        else []
-    )
     rows += _moved(part, "Dynamic stiffness")
     return rows if result.profile is None else [*rows, (1.2, (partial(_profile, result=result),))]
 
 
-def _moved(part: Any, title: str) -> list[tuple[float, tuple[Panel, ...]]]:
+def _moved(part: Any, title: str) -> list[Row]:
     """Rows for the dynamic stiffness of a part that has one."""
     if part.stiffness is None:
         return []
     measured, fitted = part.target.stiffness.known, ("fit", part.stiffness)
+    half = partial(_gain, response=measured, curve=fitted, title=title)
     return [
-        (
-            1.9,
-            (
-                partial(_gain, response=measured, curve=fitted, title=title),
-                partial(_phase, response=measured, curve=fitted),
-            ),
-        ),
+        (1.9, (half, partial(_phase, response=measured, curve=fitted))),
         (1.5, (partial(stiffness_residuals, part=part),)),
     ]
 
@@ -174,7 +142,7 @@ def _spectra(ax: Axes, part: Any, *, log: bool, title: str = "") -> None:
         _log_limits(ax, part, fitted)
     else:
         ax.set(xlim=(0, frequency[-1] + frequency[0]), ylim=(0, None))
-    ax.set_ylabel("Power (fraction per bin)")
+    ax.set_ylabel(PER_BIN)
     without_legend(ax)
 
 
@@ -217,25 +185,26 @@ def _residuals(ax: Axes, part: Any, verdict: tuple[str, float | None] = ("", Non
     """Bars, with the range that one and two standard deviations cover if these are known; how close
     the fit is."""
     frequency, residual = np.asarray(part.frequency_hz), np.asarray(part.residual)
-    known = part.deviation is not None
-    outside = np.abs(residual) > 2 if known else np.zeros(residual.shape, bool)
+    known, finite = part.deviation is not None, np.isfinite(residual)
+    outside = (np.abs(residual) > 2) & known
     width = 0.7 * np.min(np.diff(frequency), initial=math.inf)
-    bars = {"width": width if math.isfinite(width) else 0.1, "zorder": 3}
-    heights = np.where(np.isfinite(residual), residual, 0.0)
-    drawn = ax.bar(frequency, heights, color=np.where(outside, VERMILLION, BLUE), **bars)
+    drawn = ax.bar(
+        frequency,
+        np.where(finite, residual, 0.0),
+        width if math.isfinite(width) else 0.1,
+        color=np.where(outside, VERMILLION, BLUE),
+        zorder=3,
+    )
     for first in np.flatnonzero(outside)[:1]:
         drawn[first].set_label("residual beyond 2 SD")
     _closeness(ax, part, *verdict)
-    ax.set(xlabel="Frequency (Hz)", xlim=(0, frequency[-1] + frequency[0]))
-    reach = (
-        float(np.max(np.abs(residual), where=np.isfinite(residual), initial=3.0 if known else 0.1))
-        * 1.1
-    )
-    ax.set(ylim=(-reach, reach), ylabel="Residual (SD)" if known else "Residual (ln units)")
+    least = 3.0 if known else 0.1
+    reach = 1.1 * float(np.max(np.abs(residual), where=finite, initial=least))
+    ax.set(xlim=(0, frequency[-1] + frequency[0]), ylim=(-reach, reach))
+    ax.set(xlabel="Frequency (Hz)", ylabel="Residual (SD)" if known else "Residual (ln units)")
     if known:
-        for deviations, grey in ((2, 0.06), (1, 0.13)):
-            ax.axhspan(-deviations, deviations, color=shade(grey), lw=0, zorder=0)
-    if not np.isfinite(residual).all():
+        shade_deviations(ax)
+    if not finite.all():
         _say(ax, "no finite fit")
     ax.axhline(0, color=ink(), lw=0.6, zorder=4)
 
@@ -243,15 +212,16 @@ def _residuals(ax: Axes, part: Any, verdict: tuple[str, float | None] = ("", Non
 def _closeness(ax: Axes, part: Any, said: str, p: float | None) -> None:
     """The verdict of the fit with its χ²; of one target among several the χ² of the line that is
     drawn."""
-    own = (
-        "no χ² (spread unknown)"
-        if part.chi2_per_bin is None
-        else f"χ² per bin {part.chi2_per_bin:.2f}"
-    )
-    words = own if p is None else f"{said.replace('chi2', 'χ²')}, {probability(p)}"
+    if not np.isfinite(part.fitted).all():
+        words = "Residual"
+    elif p is not None:
+        words = f"{said.replace('chi2', 'χ²')}, {probability(p)}"
+    elif part.chi2_per_bin is None:
+        words = "no χ² (spread unknown)"
+    else:
+        words = f"χ² per bin {part.chi2_per_bin:.2f}"
     green = DARK_GREEN if shade(0.0) > shade(1.0) else GREEN
-    color = ink() if p is None else green if p >= 0.01 else VERMILLION
-    ax.set_title(words if np.isfinite(part.fitted).all() else "Residual", color=color)
+    ax.set_title(words, color=ink() if p is None else green if p >= 0.01 else VERMILLION)
 
 
 def _stretch(ax: Axes, part: Any, relative: bool) -> None:
@@ -286,16 +256,12 @@ def _profile(ax: Axes, result: Any) -> None:
     if result.harmonic_p_value is not None:
         ax.set_title(f"harmonic p = {result.harmonic_p_value:.2g}", loc="right", weight="normal")
     top = float(np.max(rise, where=np.isfinite(rise), initial=2 * ALLOWED))
-    ax.set(
-        xlabel="Frequency (Hz)",
-        ylabel="Δχ²",
-        xlim=(0, frequency[-1] + frequency[0]),
-        ylim=(0, 1.05 * top),
-    )
+    ax.set(xlim=(0, frequency[-1] + frequency[0]), ylim=(0, 1.05 * top))
+    ax.set(xlabel="Frequency (Hz)", ylabel="Δχ²")
 
 
 def _say(ax: Axes, message: str, color: str = VERMILLION) -> None:
     """A panel that has nothing to show."""
     ax.set(xticks=[], yticks=[])
-    style: dict[str, Any] = {"ha": "center", "va": "bottom", "color": color, "weight": "bold"}
-    ax.text(0.5, 0.52, message, transform=ax.transAxes, **style)
+    style: Style = {"transform": ax.transAxes, "color": color, "weight": "bold"}
+    ax.text(0.5, 0.52, message, ha="center", va="bottom", **style)

@@ -6,17 +6,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
 
 from ._style import (
     BLUE,
     COLUMN,
     GREY,
     VERMILLION,
+    AnyFigure,
+    Style,
     canvas,
-    fitted_to,
-    heading,
-    key,
+    finish,
     log_axis,
     shade,
     styled,
@@ -32,7 +31,7 @@ PALE = -0.6
 
 
 @styled
-def identifiability(report: Any, ax: Axes | None = None) -> Figure | SubFigure:
+def identifiability(report: Any, ax: Axes | None = None) -> AnyFigure:
     """Draws singular values and standard errors, now and with each further measurement.
 
     Above, the singular values of the Jacobian, one for each direction of the parameters: filled
@@ -42,26 +41,22 @@ def identifiability(report: Any, ax: Axes | None = None) -> Figure | SubFigure:
     measurements.
     """
     letters = {d.name: report.letter(i) for i, d in enumerate(report.designs)}
-    shown = [
-        report.present,
-        *(d for d in report.designs if d.failed is None),
-        *report.telling_pairs[:PAIRS],
-    ]
-    marks = [
-        "now",
-        *(" + ".join(letters[name] for name in o.name.split(report.together)) for o in shown[1:]),
-    ]
+    possible = [d for d in report.designs if d.failed is None]
+    shown = [report.present, *possible, *report.telling_pairs[:PAIRS]]
+    marks = [" + ".join(letters[name] for name in o.name.split(report.together)) for o in shown[1:]]
+    marks = ["now", *marks]
     labels = [_label(mark, o.name) for mark, o in zip(marks, shown, strict=True)]
     lines = sum(label.count("\n") + 1 for label in labels)
-    names = [name for name in report.told if not name.startswith("band_")]  # these are in the table
+    names = [
+        name for name in report.names if not name.startswith("band_")
+    ]  # these are in the table
     heights = [0.7 + TEXT * lines + DOTS * len(shown), 1.1 + ROW * len(names)]
     width = max(COLUMN, NAMES + CELL * len(shown))
-    fig = canvas(ax, (width, sum(heights)))
+    fig = canvas(ax, heights, width)
     upper, lower = fig.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
     _singular_values(upper.add_subplot(), shown, labels, report.threshold)
     _matrix(lower.add_subplot(), shown, marks, names, report.open_in_fit)
-    fitted_to(fig, sum(heights), heading(fig, report.target, bad=report.doubt) + key(fig, 3), width)
-    return fig
+    return finish(fig, heights, report.target, bad=report.doubt, columns=3, width=width)
 
 
 def _label(mark: str, name: str) -> str:
@@ -73,32 +68,36 @@ def _label(mark: str, name: str) -> str:
 def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: float) -> None:
     """Words and a row of dots for each design: filled where determined, counted at the edge where
     smaller than the axis."""
-    top = EDGE, threshold, *(float(o.singular_values.max()) for o in shown)
     ax.axvspan(EDGE, threshold, color=shade(0.06), lw=0, zorder=0)
-    open_: dict[str, Any] = {"facecolor": "none", "edgecolor": VERMILLION, "zorder": 3}
-    row = 0.0
+    words: dict[str, Any] = {
+        "transform": ax.get_yaxis_transform(),
+        "va": "top",
+        "linespacing": 1.05,
+    }
+    open_: Style = {"facecolor": "none", "edgecolor": VERMILLION}
+    row, top = 0.0, max(float(o.singular_values.max()) for o in shown)
     for outlook, label in zip(shown, labels, strict=True):
         size = outlook.singular_values
         known, tiny = size >= threshold, size < LEAST
         at = row + TEXT * (label.count("\n") + 1) + 0.35 * DOTS
-        words: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "linespacing": 1.05}
-        ax.text(0.0, row, label, va="top", **words)
-        ax.text(1.0, row, f"{known.sum()} of {len(size)}", va="top", ha="right", **words)
+        ax.text(0.0, row, label, **words)
+        ax.text(1.0, row, f"{known.sum()} of {len(size)}", ha="right", **words)
         ax.axhline(at, color=shade(0.2), lw=0.5, zorder=0)
         # not through the words
         ax.vlines(threshold, at - 0.5 * DOTS, at + 0.5 * DOTS, color=GREY, lw=0.8, zorder=1)
-        ax.scatter(
-            size[known], np.full(known.sum(), at), s=18, color=BLUE, label="determined", zorder=3
-        )
-        some = ~known & ~tiny
-        ax.scatter(size[some], np.full(some.sum(), at), s=18, label="not determined", **open_)
+        for which, name, style in (
+            (known, "determined", {"color": BLUE}),
+            (~known & ~tiny, "not determined", open_),
+        ):
+            places = np.full(which.sum(), at)
+            ax.scatter(size[which], places, s=18, label=name, zorder=3, **style)
         if tiny.any():
-            ax.scatter(
-                [1.15 * EDGE], [at], s=18, marker="<", label=f"how many below {LEAST:g}", **open_
-            )
+            style: Style = {"marker": "<", "label": f"how many below {LEAST:g}"} | open_
+            ax.scatter([1.15 * EDGE], [at], s=18, zorder=3, **style)
             ax.text(1.35 * EDGE, at, f"{tiny.sum()}", va="center", color=VERMILLION, zorder=3)
         row = at + 0.65 * DOTS
-    ax.set(xlim=(EDGE, 1.6 * max(top)), ylim=(row + 0.02, -0.02), yticks=[])
+    right = 1.6 * max(EDGE, threshold, top)
+    ax.set(xlim=(EDGE, right), ylim=(row + 0.02, -0.02), yticks=[])
     log_axis(ax)
     ax.set_xlabel("Singular value (per prior standard deviation)")
     ax.set_title(f"Combinations of parameters: determined from {threshold:g} on")
@@ -122,23 +121,12 @@ def _matrix(
             known = outlook.quantities[name]
             number, _, unit = known.percent.partition(" ")
             sure = known.determined and (j > 0 or name not in doubted)
-            ax.text(
-                j,
-                i,
-                number,
-                ha="center",
-                va="center",
-                color="black",
-                weight="bold" if sure else "normal",
-            )
+            weight = "bold" if sure else "normal"
+            ax.text(j, i, number, ha="center", va="center", color="black", weight=weight)
         labels.append(_wrapped(name) + (f" ({unit})" if unit != "%" else ""))
     ax.set_yticks(range(len(names)), labels, linespacing=0.9)
-    ax.set_xticks(
-        range(len(shown)),
-        [mark.replace(" + ", "\n+") for mark in marks],
-        weight="bold",
-        linespacing=0.95,
-    )
+    marks = [mark.replace(" + ", "\n+") for mark in marks]
+    ax.set_xticks(range(len(shown)), marks, weight="bold", linespacing=0.95)
     ax.set_xticks(np.arange(len(shown) + 1) - 0.5, minor=True)
     ax.set_yticks(np.arange(len(names) + 1) - 0.5, minor=True)
     ax.grid(which="minor", color="white", lw=1.5)

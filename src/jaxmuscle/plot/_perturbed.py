@@ -5,21 +5,21 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
 
+from ._recording import whole_trace
 from ._stiffness import POINTS, Curve, gain, phase
 from ._style import (
     BLUE,
-    COLUMN,
     GREY,
-    ORANGE,
     VERMILLION,
+    AnyFigure,
     canvas,
-    fitted_to,
+    finish,
+    fit_height,
     heading,
     ink,
-    key,
     legend,
+    panels,
     styled,
 )
 
@@ -28,7 +28,7 @@ CHANCE = 0.05
 
 
 @styled
-def frequency_response(response: Any, ax: Axes | None = None) -> Figure | SubFigure:
+def frequency_response(response: Any, ax: Axes | None = None) -> AnyFigure:
     """Draws a frequency response: gain and phase with two standard errors either way, and the
     coherence.
 
@@ -36,16 +36,14 @@ def frequency_response(response: Any, ax: Axes | None = None) -> Figure | SubFig
     dashed line.
     """
     heights = (1.7, 1.2, 1.3)
-    fig = canvas(ax, (COLUMN, sum(heights)))
-    panels = fig.subplots(3, 1, sharex=True, height_ratios=heights)
-    _response(panels, response)
-    fig.align_ylabels(panels)
-    fitted_to(fig, sum(heights), heading(fig, response.name))
-    return fig
+    fig, axes = panels(ax, "A;B;C", heights, sharex=True)
+    _response(axes, response)
+    fig.align_ylabels(axes)
+    return fit_height(fig, heights, heading(fig, response.name))
 
 
 @styled
-def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
+def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> AnyFigure:
     """Draws a recording of force and displacement: both with the window, four seconds of it larger,
     and the response.
 
@@ -53,7 +51,7 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     `settings`: `SpectrumSettings` or a name, as of `Recording.spectrum`.
     """
     heights = (1.2, 1.3, 1.5, 1.1, 1.2)
-    fig = canvas(ax, (COLUMN, sum(heights)))
+    fig = canvas(ax, heights)
     halves = sum(heights[:2]), sum(heights[2:])
     upper, lower = fig.subfigures(2, 1, squeeze=False, height_ratios=halves)[:, 0]
     traces, closer = upper.subplots(2, 2, sharex="col", sharey="row", width_ratios=(1.6, 1)).T
@@ -62,10 +60,7 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
         (recording.displacement, 1e3, "Lengthening (mm)", VERMILLION),
     )
     for whole, near, (channel, scale, label, colour) in zip(traces, closer, channels, strict=True):
-        time = channel.start + np.arange(channel.whole.size) / channel.rate
-        whole.plot(time, scale * channel.whole, color=colour, lw=0.5)
-        if channel.window is not None:
-            whole.axvspan(*channel.window, color=ORANGE, alpha=0.25, lw=0, label="window")
+        whole_trace(whole, channel, "window", scale, color=colour, lw=0.5)
         shown = slice(0, round(SHOWN * channel.rate))
         near.plot(channel.time[shown], scale * channel.samples[shown], color=colour, lw=0.9)
         whole.set_ylabel(label)
@@ -82,8 +77,7 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     _response(panels, response, ("spring, damper, mass", line))
     upper.align_ylabels(traces)
     lower.align_ylabels(panels)
-    fitted_to(fig, sum(heights), heading(fig, recording.name) + key(fig))
-    return fig
+    return finish(fig, heights, recording.name)
 
 
 def _response(

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
@@ -20,9 +19,11 @@ from ._style import (
     PROPORTIONAL,
     SKY,
     VERMILLION,
+    AnyFigure,
+    Style,
     axes_or_new,
     canvas,
-    fitted_to,
+    fit_height,
     heading,
     log_axis,
     styled,
@@ -41,21 +42,27 @@ MASS = (0.95, 0.8, 0.5)
 REGIONS = ("#cfe6f5", SKY, BLUE)  # of this mass
 
 
-def chosen(found: Any) -> list[str]:
+def names_to_draw(found: Any) -> list[str]:
     """What a corner figure shows: the quantities that the data determine, and the harmonic's
     frequency."""
-    told = {n: n.partition("@")[0] for n in found.quantities}
-    free = {n for n in found.samples if told[n] == "harmonic_frequency"}
-    names = [
-        n for n, base in told.items() if base in ORDER and (n in found.determined or n in free)
+    known = [name for name in found.quantities if name in found.determined]
+    free = [name for name in found.samples if name.startswith("harmonic_frequency")]
+    asked = [
+        name
+        for base in ORDER
+        for name in found.quantities
+        if name.partition("@")[0] == base and (name in known or name in free)
     ]
-    names.sort(key=lambda n: ORDER.index(told[n]))
-    more = [n for n in found.quantities if n in found.determined and n not in names]
-    return (names + more)[:MOST]
+    return list(dict.fromkeys([*asked, *known]))[:MOST]
+
+
+def _require_mixed(found: Any) -> None:
+    if not found.success:
+        raise NotMixedError(f"{found.title}: {found.message}")
 
 
 @styled
-def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
+def posterior(found: Any, ax: Axes | None = None) -> AnyFigure:
     """Draws the posterior `found` of what the data determine: densities, and 50, 80 and 95 %
     regions of pairs.
 
@@ -65,9 +72,8 @@ def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     **Raises:** `NotMixedError` if the chains did not mix; `ValueError` if the data determine
     nothing.
     """
-    if not found.success:
-        raise NotMixedError(f"{found.title}: {found.message}")
-    names = chosen(found)[:PAIRS]
+    _require_mixed(found)
+    names = names_to_draw(found)[:PAIRS]
     if not names:
         raise ValueError(
             f"{found.title}: the data determine no quantity, so there is nothing to draw"
@@ -76,26 +82,25 @@ def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     draws = [found.quantities[name].ravel() for name in names]
     limits = [np.quantile(x, CUT) for x in draws]
     size = COLUMN if count > 2 else 3.0
-    fig = canvas(ax, (size, size), w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
+    fig = canvas(ax, [size], size, w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
     axes = fig.subplots(count, count, squeeze=False)
-    for i in range(count):
-        for j in range(count):
-            panel = axes[i, j]
-            if j > i:
-                panel.remove()
-                continue
-            panel.set_xlim(*limits[j])
-            panel.locator_params(nbins=2)
-            panel.tick_params(labelbottom=i == count - 1, labelleft=j == 0 and i > 0)
-            if i == j:
-                _density(panel, draws[i])
-            else:
-                _pair(panel, draws[j], draws[i], limits[j], limits[i])
-            if i == count - 1:
-                panel.set_xlabel(_label(found, names[j]))
-                panel.tick_params(axis="x", rotation=90)
-            if j == 0 and i > 0:
-                panel.set_ylabel(_label(found, names[i]))
+    for (i, j), panel in np.ndenumerate(axes):
+        if j > i:
+            panel.remove()
+            continue
+        lowest, first = i == count - 1, j == 0 and i > 0
+        panel.set_xlim(*limits[j])
+        panel.locator_params(nbins=2)
+        panel.tick_params(labelbottom=lowest, labelleft=first)
+        if i == j:
+            _density(panel, draws[i])
+        else:
+            _pair(panel, draws[j], draws[i], limits[j], limits[i])
+        if lowest:
+            panel.set_xlabel(_label(found, names[j]))
+            panel.tick_params(axis="x", rotation=90)
+        if first:
+            panel.set_ylabel(_label(found, names[i]))
     fig.align_labels()
     heading(fig, found.title)
     if count > 1:
@@ -105,16 +110,12 @@ def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
 
 def _explained() -> list[Any]:
     """What lines and areas are, in the empty corner."""
-    regions = [
-        Patch(color=color, label=f"region of {100 * mass:g} %")
-        for mass, color in zip(MASS, REGIONS, strict=True)
-    ]
-    interval = Patch(color=BLUE, alpha=0.08, label="95 % interval")
+    regions = zip(MASS, REGIONS, strict=True)
     return [
         Patch(color=SKY, alpha=0.6, label="density"),
         Line2D([], [], color=BLUE, lw=1.0, label="median"),
-        interval,
-        *regions,
+        Patch(color=BLUE, alpha=0.08, label="95 % interval"),
+        *(Patch(color=color, label=f"region of {100 * mass:g} %") for mass, color in regions),
     ]
 
 
@@ -123,19 +124,11 @@ def _label(found: Any, name: str) -> str:
 
 
 def _density(ax: Axes, x: np.ndarray) -> None:
-    ax.hist(
-        x,
-        bins=60,
-        range=ax.get_xlim(),
-        density=True,
-        histtype="stepfilled",
-        color=SKY,
-        alpha=0.6,
-        lw=0,
-    )
-    low, middle, high = np.quantile(x, (0.025, 0.5, 0.975))
-    ax.axvline(float(middle), color=BLUE, lw=1.0)
-    ax.axvspan(float(low), float(high), color=BLUE, alpha=0.08, lw=0)
+    style: Style = {"histtype": "stepfilled", "color": SKY, "alpha": 0.6, "lw": 0}
+    ax.hist(x, bins=60, range=ax.get_xlim(), density=True, **style)
+    low, middle, high = np.quantile(x, (0.025, 0.5, 0.975)).tolist()
+    ax.axvline(middle, color=BLUE, lw=1.0)
+    ax.axvspan(low, high, color=BLUE, alpha=0.08, lw=0)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
 
@@ -148,10 +141,9 @@ def _pair(ax: Axes, x: np.ndarray, y: np.ndarray, wide: np.ndarray, high: np.nda
     order = np.sort(smooth.ravel())[::-1]
     inside = np.cumsum(order) / order.sum()
     levels = np.unique([order[np.searchsorted(inside, mass)] for mass in MASS])
-    mid = 0.5 * (xs[1:] + xs[:-1]), 0.5 * (ys[1:] + ys[:-1])
-    ax.contourf(
-        *mid, smooth.T, levels=[*levels, smooth.max() * 1.01], colors=list(REGIONS[-len(levels) :])
-    )
+    middles = (0.5 * (edges[1:] + edges[:-1]) for edges in (xs, ys))
+    colors = list(REGIONS[-len(levels) :])
+    ax.contourf(*middles, smooth.T, levels=[*levels, smooth.max() * 1.01], colors=colors)
     ax.set_ylim(*high)
     ax.locator_params(nbins=2)
 
@@ -163,33 +155,19 @@ def predictive(found: Any, ax: Axes | None = None, target: str | None = None) ->
 
     **Raises:** `NotMixedError`.
     """
-    if not found.success:
-        raise NotMixedError(f"{found.title}: {found.message}")
+    _require_mixed(found)
     part = found.only if target is None else found.parts[target]
     ax = axes_or_new(ax)
-    f = np.asarray(part.target.frequency)
-    power = part.replicates.power.reshape(-1, len(f))
-    expected = part.replicates.expected.reshape(-1, len(f))
-    for low, high, alpha in BANDS:
-        label = f"predicted, {100 * (high - low):.0f} %"
-        ax.fill_between(
-            f,
-            *np.quantile(power, (low, high), axis=0),
-            color=SKY,
-            alpha=alpha + 0.1,
-            lw=0,
-            label=label,
-        )
-    ax.plot(f, np.median(expected, axis=0), color=BLUE, lw=1.2, label="model, median")
-    ax.plot(
-        f,
-        np.asarray(part.target.proportional_power),
-        color=VERMILLION,
-        marker="o",
-        ms=3,
-        lw=0,
-        label="target",
+    f, measured = (np.asarray(x) for x in (part.target.frequency, part.target.proportional_power))
+    power, expected = (
+        x.reshape(-1, len(f)) for x in (part.replicates.power, part.replicates.expected)
     )
+    for low, high, alpha in BANDS:
+        edges = np.quantile(power, (low, high), axis=0)
+        label = f"predicted, {100 * (high - low):.0f} %"
+        ax.fill_between(f, *edges, color=SKY, alpha=alpha + 0.1, lw=0, label=label)
+    ax.plot(f, np.median(expected, axis=0), color=BLUE, lw=1.2, label="model, median")
+    ax.plot(f, measured, color=VERMILLION, marker="o", ms=3, lw=0, label="target")
     log_axis(ax, "y")
     ax.set(xlabel="Frequency (Hz)", ylabel=PROPORTIONAL, xlim=(0, f[-1] + f[0]))
     ax.set_title(f"{part.target.name}, p = {part.replicates.p_value:.2g}", parse_math=False)
@@ -198,28 +176,24 @@ def predictive(found: Any, ax: Axes | None = None, target: str | None = None) ->
 
 
 @styled
-def chains(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
+def chains(found: Any, ax: Axes | None = None) -> AnyFigure:
     """Draws every chain of the posterior `found` over its draws, also of chains that did not
     mix."""
-    names = chosen(found) or list(found.samples)[:MOST]
-    fig = canvas(ax, (COLUMN, 0.9 * len(names)))
-    axes = fig.subplots(len(names), 1, sharex=True, squeeze=False)
-    for panel, name in zip(axes[:, 0], names, strict=True):
+    names = names_to_draw(found) or list(found.samples)[:MOST]
+    heights = [0.9] * len(names)
+    fig = canvas(ax, heights)
+    axes = fig.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, name in zip(axes, names, strict=True):
         for number, chain in enumerate(found.quantities[name]):
             panel.plot(chain, lw=0.3, color=PALETTE[number % len(PALETTE)])
         r_hat, bulk, _ = found.diagnostics[name]
-        panel.set_title(
-            in_words(name, found.unit(name)), pad=3.0, weight="normal", parse_math=False
-        )
-        panel.set_title(f"R-hat {r_hat:.3f}, ESS {bulk:.0f}", pad=3.0, weight="normal", loc="right")
-        panel.set_ylabel(
-            "ratio" if found.unit(name) in ("", "1") else unit_in_print(found.unit(name))
-        )
+        unit, style = found.unit(name), {"pad": 3.0, "weight": "normal"}
+        panel.set_title(in_words(name, unit), parse_math=False, **style)
+        panel.set_title(f"R-hat {r_hat:.3f}, ESS {bulk:.0f}", loc="right", **style)
+        panel.set_ylabel("ratio" if unit in ("", "1") else unit_in_print(unit))
         for draw in np.unique(np.nonzero(found.chains.diverging)[1]):
             panel.axvline(draw, color=ORANGE, lw=0.5, zorder=0)
-    axes[-1, 0].set_xlabel("Draw")
+    axes[-1].set_xlabel("Draw")
     fig.align_ylabels()
-    fitted_to(
-        fig, 0.9 * len(names), heading(fig, found.title, bad="" if found.success else "Not mixed")
-    )
-    return fig
+    lines = heading(fig, found.title, bad="Not mixed" * (not found.success))
+    return fit_height(fig, heights, lines)

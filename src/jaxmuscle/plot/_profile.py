@@ -5,26 +5,29 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
 
 from ._numbers import unit_in_print
 from ._style import (
+    ACROSS,
     BLUE,
-    COLUMN,
     GREY,
     ORANGE,
+    AnyFigure,
+    Style,
     axes_or_new,
     canvas,
-    fitted_to,
-    heading,
-    key,
+    finish,
     log_axis,
+    panel_grid,
+    rows_for,
     styled,
     without_legend,
 )
 
 SHOWN = 3.0  # times the threshold
-HEIGHT, ACROSS = 1.7, 2  # inches, panels
+HEIGHT = 1.7  # inches
+# whether the lower and the upper end are open
+OPEN = {(True, True): "on both sides", (True, False): "downwards", (False, True): "upwards"}
 
 
 @styled
@@ -32,50 +35,31 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
     """Draws a profile likelihood with its interval and the parabola of the curvature. Returns the
     axes (`ax` or new)."""
     ax = axes_or_new(ax)
-    ax.plot(found.values, found.rise, color=BLUE, marker="o", ms=2.5, lw=1.2, label="profile")
-    ax.axhline(
-        found.threshold,
-        color=GREY,
-        lw=0.8,
-        ls=(0, (4, 2)),
-        label=f"{100 * found.level:g} % threshold",
-    )
+    values, rise, percent = found.values, found.rise, f"{100 * found.level:g} %"
+    ax.plot(values, rise, color=BLUE, marker="o", ms=2.5, lw=1.2, label="profile")
+    style: Style = {"color": GREY, "lw": 0.8, "ls": (0, (4, 2))}
+    ax.axhline(found.threshold, label=f"{percent} threshold", **style)
     for number, (low, high) in enumerate(found.intervals):
-        ends = found.values[0] if low is None else low, found.values[-1] if high is None else high
-        ax.axvspan(
-            *ends,
-            color=BLUE,
-            alpha=0.1,
-            lw=0,
-            label=f"{100 * found.level:g} % interval" if not number else None,
-        )
-    wide = np.all(found.values > 0) and found.values[-1] > 10 * found.values[0]
-    if wide:
-        x = np.geomspace(found.values[0], found.values[-1], 200)
-        parabola = (np.log(x / found.value) * found.value / found.stderr) ** 2
-    else:
-        x = np.linspace(found.values[0], found.values[-1], 200)
-        parabola = ((x - found.value) / found.stderr) ** 2
-    top = min(SHOWN * found.threshold, 1.05 * max(float(found.rise.max()), 1.2 * found.threshold))
+        ends = values[0] if low is None else low, values[-1] if high is None else high
+        label = None if number else f"{percent} interval"
+        ax.axvspan(*ends, color=BLUE, alpha=0.1, lw=0, label=label)
+    wide = np.all(values > 0) and values[-1] > 10 * values[0]
     if found.name != "harmonic_frequency":
-        ax.plot(x, parabola, color=ORANGE, lw=0.9, label="by curvature")
-    seen = found.values[np.flatnonzero(_beside(found.rise <= top))]
-    ax.set(ylim=(0, top), xlim=(seen[0], seen[-1]), ylabel="Rise of -2 ln L")
+        x = (np.geomspace if wide else np.linspace)(values[0], values[-1], 200)
+        # the curvature of a positive quantity is that of its logarithm
+        away = np.log(x / found.value) * found.value if wide else x - found.value
+        ax.plot(x, (away / found.stderr) ** 2, color=ORANGE, lw=0.9, label="by curvature")
+    top = min(SHOWN * found.threshold, 1.05 * max(float(rise.max()), 1.2 * found.threshold))
+    shown = values[np.flatnonzero(_beside(rise <= top))]
+    ax.set(ylim=(0, top), xlim=(shown[0], shown[-1]), ylabel="Rise of -2 ln L")
     if wide:
         log_axis(ax)
     ax.set_xlabel(found.name + ("" if found.unit == "1" else f" ({unit_in_print(found.unit)})"))
     ax.set_title(f"{found.target}: profile likelihood", pad=32, parse_math=False)
-    if found.low is None or found.high is None:
-        side = (
-            "on both sides"
-            if found.low is found.high
-            else "downwards"
-            if found.low is None
-            else "upwards"
-        )
-        ax.text(
-            0.99, 0.97, f"open {side}", transform=ax.transAxes, color=GREY, ha="right", va="top"
-        )
+    side = OPEN.get((found.low is None, found.high is None))
+    if side is not None:
+        style = {"transform": ax.transAxes, "color": GREY, "ha": "right", "va": "top"}
+        ax.text(0.99, 0.97, f"open {side}", **style)
     ax.legend(
         frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0
     )
@@ -83,7 +67,7 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
 
 
 @styled
-def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> Figure | SubFigure:
+def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> AnyFigure:
     """Draws several `profiles` of one fit beside each other, each as `profile` does, with one
     legend; `ax`, their place.
 
@@ -91,16 +75,12 @@ def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> Figure | SubFig
     """
     if not profiles:
         raise ValueError("profiles: is empty; give [jm.profile(result, name) for name in ...]")
-    columns = min(len(profiles), ACROSS)
-    rows = -(-len(profiles) // columns)
-    fig = canvas(ax, (COLUMN, HEIGHT * rows))
-    for number, found in enumerate(profiles, start=1):
-        panel = profile(found, fig.add_subplot(rows, columns, number))
-        panel.set_title("")
-        panel.set_ylabel("Rise of -2 ln L")
-        without_legend(panel)
-    fitted_to(fig, HEIGHT * rows, heading(fig, profiles[0].target) + key(fig))
-    return fig
+    across = min(len(profiles), ACROSS)
+    heights = [HEIGHT] * rows_for(len(profiles), across)
+    fig = canvas(ax, heights)
+    for panel, found in zip(panel_grid(fig, len(profiles), across)[0], profiles, strict=True):
+        without_legend(profile(found, panel)).set_title("")
+    return finish(fig, heights, profiles[0].target)
 
 
 def _beside(inside: np.ndarray) -> np.ndarray:

@@ -5,52 +5,63 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
 from ._style import (
     BLUE,
-    COLUMN,
     GREY,
     ORANGE,
     SKY,
+    AnyFigure,
+    Style,
     canvas,
     density_unit,
-    fitted_to,
-    heading,
+    finish,
+    frequency_axes,
     ink,
-    key,
-    log_axis,
+    panels,
+    positive,
     styled,
 )
 
 MOST = 8  # traces of trials that are drawn
+DOTS: Style = {"lw": 1.0, "marker": "o", "ms": 2.8}
 
 
 @styled
-def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
+def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> AnyFigure:
     """Draws a recording: the trace with its window, the window larger, and its spectra (Welch,
     FFT), linear, logarithmic.
 
     `settings`: `SpectrumSettings` or a name, as of `Recording.spectrum`.
     """
     heights = (1.2, 1.4, 1.9)
-    fig = canvas(ax, (COLUMN, sum(heights)))
-    grid = fig.add_gridspec(3, 2, height_ratios=heights)
-    _trace(fig.add_subplot(grid[0, :]), recording)
-    _window(fig.add_subplot(grid[1, :]), recording, settings)
+    fig, (whole, window, *spectra) = panels(ax, "AA;BB;CD", heights)
+    whole_trace(whole, recording, "window", color=BLUE, lw=0.7)
+    _window(window, recording, settings)
+    for panel, title in ((whole, "Whole recording"), (window, "Window")):
+        panel.margins(x=0)
+        panel.set(title=title, xlabel="Time (s)")
+        panel.set_ylabel(f"{_quantity(recording)} ({recording.unit})", parse_math=False)
     welch, fft = recording.spectrum(settings), recording.fft_spectrum(settings)
     band = recording.target("welch", quantity="force", settings=settings).sampling_band()
-    edges = [edge * np.sum(welch.power) for edge in band or ()]
     label = f"Welch, {recording.segments(settings)} segments"
-    for column, log in enumerate((False, True)):
-        _spectra(fig.add_subplot(grid[2, column]), welch, fft, edges, label, log)
-    fitted_to(fig, sum(heights), heading(fig, recording.name) + key(fig))
-    return fig
+    for panel, log in zip(spectra, (False, True), strict=True):
+        f, power = np.asarray(welch.frequency), np.asarray(welch.power)
+        shown = positive(f, log)
+        style: Style = {"color": GREY, "lw": 0.6, "alpha": 0.8, "zorder": 2}
+        panel.plot(fft.frequency, fft.power, label="FFT of the window", **style)
+        if band:
+            edges = (edge[shown] * np.sum(power) for edge in band)
+            area: Style = {"color": BLUE, "alpha": 0.2, "lw": 0, "zorder": 3}
+            panel.fill_between(f[shown], *edges, label="± 1 SD", **area)
+        panel.plot(f[shown], power[shown], color=ink(), label=label, zorder=4, **DOTS)
+        _spectrum_axes(panel, welch.unit, log)
+    return finish(fig, heights, recording.name)
 
 
 @styled
-def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
+def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> AnyFigure:
     """Draws several recordings below each other, each with its window, and their spectra with the
     mean.
 
@@ -62,111 +73,60 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure 
         return recording(trials[0], settings, ax)
     shown = trials[:MOST]
     heights = [0.55] * len(shown) + [2.1]
-    fig = canvas(ax, (COLUMN, sum(heights)))
+    fig = canvas(ax, heights)
     grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
     whole = window = None
     for row, one in enumerate(shown):
         last = row == len(shown) - 1
         whole = fig.add_subplot(grid[row, 0], sharex=whole, sharey=whole)
-        whole.plot(one.start + np.arange(one.whole.size) / one.rate, one.whole, color=BLUE, lw=0.5)
-        if one.window is not None:
-            whole.axvspan(
-                *one.window,
-                color=ORANGE,
-                alpha=0.25,
-                lw=0,
-                label=None if row else "window: what is analysed",
-            )
-        whole.set_title(one.name, pad=2.0, weight="normal", parse_math=False)
-        _label(whole, "Time (s)" if last else "", f"({one.unit})")
-        x = one.filtered(settings)
+        whole_trace(whole, one, None if row else "window: what is analysed", color=BLUE, lw=0.5)
         window = fig.add_subplot(grid[row, 1], sharex=window, sharey=window)
+        x = one.filtered(settings)
         window.plot(np.arange(x.size) * one.duration / x.size, x, color=BLUE, lw=0.5)
-        window.set_title("" if row else "Window", pad=2.0, weight="normal")
-        _label(window, "Time in the window (s)" if last else "", f"({one.unit})")
-        for panel in (whole, window):
+        for panel, title, abscissa in (
+            (whole, one.name, "Time (s)"),
+            (window, "" if row else "Window", "Time in the window (s)"),
+        ):
+            panel.set_title(title, pad=2.0, weight="normal", parse_math=False)
+            panel.set_xlabel(abscissa if last else "")
+            panel.set_ylabel(f"({one.unit})", parse_math=False)
             panel.margins(x=0)
             panel.tick_params(labelbottom=last)
             panel.yaxis.set_major_locator(MaxNLocator(2, prune="both", min_n_ticks=2))
     mean, each = trials.spectrum(settings), [one.spectrum(settings) for one in trials]
     for column, log in enumerate((False, True)):
         panel = fig.add_subplot(grid[-1, column])
-        for one in each:
-            panel.plot(
-                one.frequency,
-                one.power,
-                color=GREY,
-                lw=0.6,
-                label=f"{len(each)} trials" if one is each[0] else None,
-            )
-        panel.plot(
-            mean.frequency, mean.power, color=ink(), lw=1.0, marker="o", ms=2.8, label="mean"
-        )
+        for number, one in enumerate(each):
+            label = None if number else f"{len(each)} trials"
+            panel.plot(one.frequency, one.power, color=GREY, lw=0.6, label=label)
+        panel.plot(mean.frequency, mean.power, color=ink(), label="mean", **DOTS)
         _spectrum_axes(panel, mean.unit, log)
-    words = f"{(trials[0].quantity or 'signal').capitalize()} of {len(trials)} trials"
     more = f", {len(shown)} shown" if len(shown) < len(trials) else ""
-    fitted_to(fig, sum(heights), heading(fig, words + more) + key(fig))
-    return fig
+    return finish(fig, heights, f"{_quantity(trials[0])} of {len(trials)} trials{more}")
 
 
-def _trace(ax: Axes, recording: Any) -> None:
+def whole_trace(
+    ax: Axes, recording: Any, label: str | None, scale: float = 1.0, **style: Any
+) -> None:
+    """The whole recording, with its window shaded and called so."""
     time = recording.start + np.arange(recording.whole.size) / recording.rate
-    ax.plot(time, recording.whole, color=BLUE, lw=0.7)
+    ax.plot(time, scale * recording.whole, **style)
     if recording.window is not None:
-        ax.axvspan(*recording.window, color=ORANGE, alpha=0.25, lw=0, label="window")
-    ax.margins(x=0)
-    _label(ax, "Time (s)", f"{(recording.quantity or 'signal').capitalize()} ({recording.unit})")
-    ax.set_title("Whole recording")
+        ax.axvspan(*recording.window, color=ORANGE, alpha=0.25, lw=0, label=label)
+
+
+def _quantity(recording: Any) -> str:
+    return (recording.quantity or "signal").capitalize()
 
 
 def _window(ax: Axes, recording: Any, settings: Any) -> None:
     x, time = recording.filtered(settings), recording.time
     ax.plot(time, recording.samples, color=SKY, lw=0.5, label="as recorded")
-    ax.plot(
-        time[0] + np.arange(x.size) / (x.size / recording.duration),
-        x,
-        color=BLUE,
-        lw=0.9,
-        label="filtered",
-    )
+    filtered = time[0] + np.arange(x.size) / (x.size / recording.duration)
+    ax.plot(filtered, x, color=BLUE, lw=0.9, label="filtered")
     ax.axhline(float(np.mean(x)), color=GREY, lw=0.6, ls="--")
-    ax.margins(x=0)
-    _label(ax, "Time (s)", f"{(recording.quantity or 'signal').capitalize()} ({recording.unit})")
-    ax.set_title("Window")
-
-
-def _spectra(ax: Axes, welch: Any, fft: Any, band: list[Any], label: str, log: bool) -> None:
-    f, power = np.asarray(welch.frequency), np.asarray(welch.power)
-    shown = slice(None) if not log else f > 0
-    ax.plot(
-        fft.frequency, fft.power, color=GREY, lw=0.6, alpha=0.8, label="FFT of the window", zorder=2
-    )
-    if band:
-        ax.fill_between(
-            f[shown],
-            band[0][shown],
-            band[1][shown],
-            color=BLUE,
-            alpha=0.2,
-            lw=0,
-            label="± 1 SD",
-            zorder=3,
-        )
-    ax.plot(f[shown], power[shown], color=ink(), lw=1.0, marker="o", ms=2.8, label=label, zorder=4)
-    _spectrum_axes(ax, welch.unit, log)
 
 
 def _spectrum_axes(ax: Axes, unit: str, log: bool) -> None:
-    _label(ax, "Frequency (Hz)", f"Power ({density_unit(unit)})")
+    frequency_axes(ax, log, f"Power ({density_unit(unit)})")
     ax.set_title("Logarithmic" if log else "Linear")
-    if log:
-        log_axis(ax, "y")
-        log_axis(ax)
-    else:
-        ax.set_xlim(left=0, auto=None)
-        ax.set_ylim(bottom=0, auto=None)
-
-
-def _label(ax: Axes, x: str, y: str) -> None:
-    ax.set_xlabel(x)
-    ax.set_ylabel(y, parse_math=False)

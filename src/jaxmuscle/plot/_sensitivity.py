@@ -2,12 +2,11 @@
 
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 
-from ._style import COLUMN, styled
+from ._style import axes_or_new, styled
 
 
 @styled
@@ -20,10 +19,7 @@ def sensitivity(sensitivity: Any, ax: Axes | None = None) -> Axes:
     """
     table = np.asarray(sensitivity.proportional)
     shown = np.flatnonzero(np.max(np.abs(table), axis=1) > 1e-6)
-    if ax is None:
-        ax = plt.figure(
-            figsize=(COLUMN, 1.6 + 0.2 * len(shown)), layout="constrained"
-        ).add_subplot()
+    ax = axes_or_new(ax, 1.6 + 0.2 * len(shown))
     frequency = np.asarray(sensitivity.frequency)
     half = 0.5 * (frequency[1] - frequency[0]) if len(frequency) > 1 else 0.5
     edges = np.append(frequency - half, frequency[-1] + half)

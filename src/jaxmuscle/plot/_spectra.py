@@ -11,12 +11,15 @@ from ._style import (
     GREY,
     PALETTE,
     PROPORTIONAL,
+    Style,
     axes_or_new,
     density_unit,
-    frequency_axis,
+    frequency_axes,
     ink,
     legend,
+    positive,
     shade,
+    shorten,
     styled,
 )
 
@@ -37,17 +40,12 @@ def estimate(estimate: Any, ax: Axes | None = None, *, log: bool = False) -> Axe
     """
     ax = axes_or_new(ax)
     frequency, whole = np.asarray(estimate.frequency), float(np.sum(estimate.power))
-    shown = slice(None) if not log else frequency > 0
-    rows = [
-        (
-            estimate.power,
-            estimate.stderr,
-            BLUE,
-            "with control variate" if estimate.expected is not None else "mean",
-        )
-    ]
-    if estimate.expected is not None:
-        rows.append((estimate.plain_power, estimate.plain_stderr, GREY, "without"))
+    shown = positive(frequency, log)
+    own = (estimate.power, estimate.stderr, BLUE)
+    plain = (estimate.plain_power, estimate.plain_stderr, GREY, "without")
+    rows = (
+        [(*own, "mean")] if estimate.expected is None else [(*own, "with control variate"), plain]
+    )
     for order, (power, stderr, color, name) in enumerate(rows):
         low, high = ((power + side * stderr)[shown] / whole for side in (-2, 2))
         ax.fill_between(
@@ -55,10 +53,7 @@ def estimate(estimate: Any, ax: Axes | None = None, *, log: bool = False) -> Axe
         )
         label = f"{name} ({estimate.seeds} seeds, ± 2 SE)"
         ax.plot(frequency[shown], power[shown] / whole, color=color, label=label, zorder=3 - order)
-    frequency_axis(ax, log)
-    legend(ax, "lower left" if log else "upper right")
-    ax.set_ylabel(PROPORTIONAL)
-    return ax
+    return _finished(ax, log)
 
 
 QUANTILES = (0.05, 0.95)
@@ -92,18 +87,17 @@ def spectrum(
     """
     ax = axes_or_new(ax)
     frequency = np.asarray(spectrum.bins)
-    rows, kind = _finite(np.asarray(spectrum.power).reshape(-1, frequency.size))
+    rows, kind = finite_rows(np.asarray(spectrum.power).reshape(-1, frequency.size))
     mean, each = rows.mean(0), rows
     if proportional:
         mean, each = mean / mean.sum(), rows / rows.sum(-1, keepdims=True)
-    shown = slice(None) if not log else frequency > 0
-    _mean_and_band(
+    shown = positive(frequency, log)
+    mean_and_band(
         ax, frequency[shown], mean[shown], each[:, shown], ", ".join(filter(None, (label, kind)))
     )
-    frequency_axis(ax, log)
-    legend(ax, "lower left" if log else "upper right")
-    ax.set_ylabel(PROPORTIONAL if proportional else f"Power ({density_unit(spectrum.unit)})")
-    return ax
+    return _finished(
+        ax, log, PROPORTIONAL if proportional else f"Power ({density_unit(spectrum.unit)})"
+    )
 
 
 @styled
@@ -126,52 +120,49 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     """
     ax = axes_or_new(ax)
     frequency, power, band = target.frequency, target.proportional_power, target.sampling_band()
-    shown = slice(None) if not log else frequency > 0
+    shown = positive(frequency, log)
     if band is not None:
-        low, high = band
         label = "± 1 SD (assumed)" if target.provenance == "reconstructed" else "± 1 SD of the data"
         ax.fill_between(
             frequency[shown],
-            low[shown],
-            high[shown],
+            *(edge[shown] for edge in band),
             color=shade(0.14),
             lw=0,
             label=label,
             zorder=1,
         )
-    name = target.name if len(target.name) <= 40 else f"{target.name[:39]}…"
-    style: dict[str, Any] = {"color": ink(), "lw": 0.6, "marker": "o", "ms": 2.8, "zorder": 3}
+    style: Style = {"color": ink(), "lw": 0.6, "marker": "o", "ms": 2.8, "zorder": 3}
     (line,) = ax.plot(frequency[shown], power[shown], **style)
     # neither hidden from the legend nor read as mathematics
-    name = name.lstrip("_").replace("$", r"\$")
+    name = shorten(target.name, 40).lstrip("_").replace("$", r"\$")
     line.set_label(f"{name} ({target.provenance})")
     if target.trial_power is not None:
         weights = np.asarray(target.segments)
         each = target.trial_power / (weights @ target.trial_power / weights.sum()).sum()
         ax.plot(frequency[shown], each.T[shown], color=shade(0.4), lw=0.5, zorder=2)
         ax.lines[-1].set_label(f"{len(each)} trials")
-    frequency_axis(ax, log)
-    ax.set_ylabel(PROPORTIONAL)
+    return _finished(ax, log)
+
+
+def _finished(ax: Axes, log: bool, ordinate: str = PROPORTIONAL) -> Axes:
+    frequency_axes(ax, log, ordinate)
     legend(ax, "lower left" if log else "upper right")
     return ax
 
 
-def _finite(
+def finite_rows(
     rows: Real[np.ndarray, "seeds values"],
 ) -> tuple[Real[np.ndarray, "finite values"], str]:
     """The rows that are finite, and what the legend calls them; nothing for the only row of one."""
     finite = np.isfinite(rows).all(-1)
+    if not finite.any():
+        return np.full_like(rows[:1], np.nan), "not finite"
     label = f"mean of {finite.sum()} seeds" if len(rows) > 1 else ""
-    if not finite.all():
-        label = (
-            f"{label}, {(~finite).sum()} not finite left out"
-            if finite.any() and label
-            else "not finite"
-        )
-    return (rows[finite] if finite.any() else np.full_like(rows[:1], np.nan)), label
+    left_out = "" if finite.all() else f", {(~finite).sum()} not finite left out"
+    return rows[finite], label + left_out
 
 
-def _mean_and_band(
+def mean_and_band(
     ax: Axes,
     x: Real[np.ndarray, " values"],
     mean: Real[np.ndarray, " values"],

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import SymLogNorm
 
-from ._style import BLUE, COLUMN, GREY, axes_or_new, ink, legend, log_axis, styled
+from ._style import BLUE, GREY, Style, axes_or_new, ink, legend, log_axis, styled
 
 
 @styled
@@ -32,9 +32,8 @@ def starts(result: Any, ax: Axes | None = None) -> Axes:
         (~settled, "x", GREY, "did not settle"),
     ):
         if which.any():
-            ax.plot(
-                rank[which], rise[which], marker, ms=3, color=color, label=f"{which.sum()} {label}"
-            )
+            words = f"{which.sum()} {label}"
+            ax.plot(rank[which], rise[which], marker, ms=3, color=color, label=words)
     ax.set(yscale="symlog", xlabel="Start, the best first", ylabel="Rise of χ²")
     ax.set_ylim(bottom=-0.1, auto=None)
     legend(ax, "above")
@@ -67,22 +66,13 @@ def start_values(result: Any, ax: Axes | None = None) -> Axes:
     positive = np.atleast_1d((values > 0).all(axis=0))
     names = [name for name, shown in zip(result.settings["free"], positive, strict=True) if shown]
     ratio, rows = (values / values[0])[:, positive], np.arange(len(names))
-    if ax is None:
-        ax = plt.figure(
-            figsize=(COLUMN, 1.0 + 0.24 * len(names)), layout="constrained"
-        ).add_subplot()
+    ax = axes_or_new(ax, 1.0 + 0.24 * len(names))
     norm = SymLogNorm(1.0, vmin=0.0, vmax=max(float(rise.max()), 1.0))
-    for i in range(len(ratio) - 1, -1, -1):
-        color = ink() if i == 0 else plt.get_cmap("viridis")(norm(rise[i]))
-        ax.plot(
-            ratio[i],
-            rows,
-            marker="o",
-            ms=2.5,
-            lw=1.2 if i == 0 else 0.6,
-            color=color,
-            zorder=2 + (i == 0),
-        )
+    colours = plt.get_cmap("viridis")
+    style: Style = {"marker": "o", "ms": 2.5}
+    for i in range(len(ratio) - 1, 0, -1):
+        ax.plot(ratio[i], rows, lw=0.6, color=colours(norm(rise[i])), **style)
+    ax.plot(ratio[0], rows, lw=1.2, color=ink(), zorder=3, **style)
     ax.set_yticks(rows, names)
     ax.set_ylim(len(names) - 0.5, -0.5)
     log_axis(ax)

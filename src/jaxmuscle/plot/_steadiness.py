@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
 
 from jaxmuscle._common.text import squared
 
-from ._style import BLUE, COLUMN, SKY, canvas, fitted_to, heading, key, log_axis, styled
+from ._style import BLUE, SKY, AnyFigure, Style, finish, log_axis, panels, styled
 
 VARIATION = "coefficient_of_variation"
 VARIATIONS = {
@@ -27,43 +26,34 @@ HEIGHTS = 1.9, 1.8  # inches
 
 
 @styled
-def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
+def steadiness(steadiness: Any, ax: Axes | None = None) -> AnyFigure:
     """Draws the steadiness of trials: power by band, coefficients of variation, entropies and DFA
     exponent.
 
     Dots are trials. Beside them, large, stands the value of all trials with its 95 % interval.
     Letters are legible in a column of 85 mm.
     """
-    fig = canvas(ax, (COLUMN, sum(HEIGHTS)))
-    grid = fig.add_gridspec(2, 2, height_ratios=HEIGHTS)
+    # nothing varies about a mean that is none
     varied = {
         words: name
         for words, name in VARIATIONS.items()
         if np.isfinite(steadiness.measures[name].value)
-    }  # nothing varies about a mean that is none
-    power = fig.add_subplot(grid[0, :])
+    }
+    fig, (power, *below) = panels(ax, "AA;BC" if varied else "AA;BB", HEIGHTS)
     bands = {_range(name): name for name in steadiness.measures if name.startswith("power_")}
     _dots(power, steadiness, bands)
     log_axis(power, "y")
-    power.set_xlabel("Frequency (Hz)")
+    power.set(xlabel="Frequency (Hz)", title="Power by band")
     power.set_ylabel(f"Power ({squared(steadiness.unit).replace('^2', '²')})", parse_math=False)
-    power.set_title("Power by band")
-    if varied:
-        variation = fig.add_subplot(grid[1, 0])
-        _dots(variation, steadiness, varied, 100.0)
-        variation.set_ylabel("SD (% of the mean)")
-        variation.set_title("Coefficient of variation")
-    regularity = fig.add_subplot(grid[1, 1 if varied else slice(None)])
-    _dots(regularity, steadiness, REGULARITY)
-    regularity.set_ylabel("Value (no unit)")
-    regularity.set_title("Regularity")
-    for panel in fig.axes[1:]:
+    kinds = [(varied, 100.0, "SD (% of the mean)", "Coefficient of variation")] * bool(varied)
+    kinds += [(REGULARITY, 1.0, "Value (no unit)", "Regularity")]
+    for panel, (names, scale, ordinate, title) in zip(below, kinds, strict=True):
+        _dots(panel, steadiness, names, scale)
         panel.margins(y=0.1)
-        panel.set_ylim(bottom=0, auto=None)
+        panel.set(ylabel=ordinate, title=title, ylim=(0, None))
     count = len(steadiness.trials)
     words = f"{count} trials" if count > 1 else next(iter(steadiness.trials))
-    fitted_to(fig, sum(HEIGHTS), heading(fig, f"Steadiness of {words}") + key(fig))
-    return fig
+    return finish(fig, HEIGHTS, f"Steadiness of {words}")
 
 
 def _range(name: str) -> str:
@@ -78,16 +68,9 @@ def _dots(ax: Axes, steadiness: Any, names: dict[str, str], scale: float = 1.0) 
     each = scale * np.array([[trial[name].value for trial in trials] for name in names.values()])
     at = np.arange(len(names))
     if len(trials) > 1:
-        label = "trials, in their order"
-        ax.plot(
-            (at[:, None] + beside).ravel(),
-            each.ravel(),
-            "o",
-            ms=2.8,
-            color=SKY,
-            zorder=3,
-            label=label,
-        )
+        places = (at[:, None] + beside).ravel()
+        style: Style = {"ms": 2.8, "color": SKY, "zorder": 3}
+        ax.plot(places, each.ravel(), "o", label="trials, in their order", **style)
     found = [steadiness.measures[name] for name in names.values()]
     value = scale * np.array([m.value for m in found])
     ends = (

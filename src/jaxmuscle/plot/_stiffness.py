@@ -9,10 +9,10 @@ from jaxtyping import Complex
 from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
-from ._style import BLUE, GREY, ORANGE, ink, legend, log_axis, shade
+from ._style import BLUE, GREY, ORANGE, Style, ink, legend, log_axis, shade_deviations
 
 Curve = tuple[str, Complex[np.ndarray, " bins"]]
-POINTS: dict[str, Any] = {"fmt": "o", "ms": 2.8, "lw": 0.8, "zorder": 3}
+POINTS: Style = {"fmt": "o", "ms": 2.8, "lw": 0.8, "zorder": 3}
 
 
 def gain(
@@ -66,8 +66,7 @@ def phase(ax: Axes, response: Any, curve: Curve | None = None) -> None:
 def stiffness_residuals(ax: Axes, part: Any) -> None:
     """Measured less fitted stiffness in standard errors, of the real and of the imaginary part."""
     f, off = part.target.stiffness.known.frequency, part.stiffness_residual
-    for deviations, grey in ((2, 0.06), (1, 0.13)):
-        ax.axhspan(-deviations, deviations, color=shade(grey), lw=0, zorder=0)
+    shade_deviations(ax)
     for values, marker, colour, name in (
         (np.real(off), "o", BLUE, "real (spring, mass)"),
         (np.imag(off), "^", ORANGE, "imaginary (damping)"),

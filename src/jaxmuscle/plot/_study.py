@@ -6,26 +6,28 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
 
 from ._style import (
-    COLUMN,
+    ACROSS,
     PALETTE,
+    PER_BIN,
+    AnyFigure,
     canvas,
     density_unit,
-    fitted_to,
-    frequency_axis,
-    key,
-    named,
+    finish,
+    frequency_axes,
+    panel_grid,
+    rows_for,
+    shorten,
     styled,
 )
 
-HEIGHT, ACROSS = 2.2, 2  # inches, panels beside each other
+HEIGHT = 2.2  # inches
 HALF, LONGEST, TITLE = 26, 40, 24  # letters: half a line of the key, a group's name, a condition's
 
 
 @styled
-def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> Figure | SubFigure:
+def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> AnyFigure:
     """Draws the spectrum of every person (thin) and the geometric mean of each group with its
     standard error (thick).
 
@@ -48,49 +50,41 @@ def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> F
             "proportional = False: power is known where everybody has at least two trials, in the"
             " same unit"
         )
-    down, across = -(-len(study.conditions) // ACROSS), min(len(study.conditions), ACROSS)
-    fig = canvas(ax, (COLUMN, HEIGHT * down))
-    axes = fig.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+    conditions, across = study.conditions, min(len(study.conditions), ACROSS)
+    heights = [HEIGHT] * rows_for(len(conditions))
+    fig = canvas(ax, heights)
+    axes, _ = panel_grid(fig, len(conditions), across, sharex=True, sharey=True)
     here = {
-        (group, condition): [
-            cell.target for cell in cells if (cell.group, cell.condition) == (group, condition)
+        group: [
+            [c.target for c in cells if (c.group, c.condition) == (group, condition)]
+            for condition in conditions
         ]
         for group in study.groups
-        for condition in study.conditions
     }
-    labels = [
-        counted(group, *(len(here[group, condition]) for condition in study.conditions))
-        for group in study.groups
-    ]
-    for place, (panel, condition) in enumerate(zip(axes.flat, study.conditions, strict=False)):
-        for number, group in enumerate(study.groups):
-            if here[group, condition]:
+    labels = [with_count(group, *map(len, targets)) for group, targets in here.items()]
+    unit = next(iter(units)) or "?"
+    ordinate = PER_BIN if proportional else f"Power ({density_unit(unit)})"
+    for place, (panel, condition) in enumerate(zip(axes, conditions, strict=True)):
+        for number, targets in enumerate(here.values()):
+            if targets[place]:
                 colour = PALETTE[number % len(PALETTE)]
-                group_spectra(panel, here[group, condition], colour, labels[number], proportional)
-        panel.set_title(named(condition, TITLE), parse_math=False)
-        frequency_axis(panel, log=True)
+                group_spectra(panel, targets[place], colour, labels[number], proportional)
+        panel.set_title(shorten(condition, TITLE), parse_math=False)
+        frequency_axes(panel, True, ordinate)
         panel.label_outer()
-        if place + across >= len(study.conditions):  # nothing stands below
+        if place + across >= len(conditions):  # nothing stands below
             panel.set_xlabel("Frequency (Hz)")
             panel.tick_params(axis="x", which="both", labelbottom=True)
-    for panel in axes.flat[len(study.conditions) :]:
-        panel.remove()
-    unit = next(iter(units)) or "?"
-    for row in axes:
-        row[0].set_ylabel(
-            "Power (fraction per bin)" if proportional else f"Power ({density_unit(unit)})"
-        )
-    fitted_to(fig, HEIGHT * down, key(fig, columns(labels), plain=True))
-    return fig
+    return finish(fig, heights, columns=columns(labels), plain=True)
 
 
-def counted(group: str, *numbers: int) -> str:
+def with_count(group: str, *numbers: int) -> str:
     """A group and how many people it has, of conditions with different numbers the range."""
     low, high = min(filter(None, numbers), default=0), max(numbers)
     people = (
         "1 person" if high == 1 else f"{high} people" if low == high else f"{low} to {high} people"
     )
-    return f"{named(group, LONGEST)} ({people})" if group else people
+    return f"{shorten(group, LONGEST)} ({people})" if group else people
 
 
 def columns(labels: list[str]) -> int:
@@ -106,14 +100,13 @@ def group_spectra(
     rows = [target.proportional_power if proportional else _power(target) for target in targets]
     for target, row in zip(targets, rows, strict=True):
         ax.plot(target.frequency, row, color=colour, lw=0.5, alpha=0.45, zorder=2)
-    log = np.log(np.stack(rows))
+    log, frequency, count = np.log(np.stack(rows)), targets[0].frequency, len(rows)
     mean = log.mean(axis=0)
-    count = len(rows)
     if count > 1:
         error = log.std(axis=0, ddof=1) / np.sqrt(count)
         band = np.exp(mean - error), np.exp(mean + error)
-        ax.fill_between(targets[0].frequency, *band, color=colour, alpha=0.25, lw=0, zorder=3)
-    ax.plot(targets[0].frequency, np.exp(mean), color=colour, lw=1.8, label=label, zorder=4)
+        ax.fill_between(frequency, *band, color=colour, alpha=0.25, lw=0, zorder=3)
+    ax.plot(frequency, np.exp(mean), color=colour, lw=1.8, label=label, zorder=4)
 
 
 def _power(target: Any) -> Float[np.ndarray, " bins"]:

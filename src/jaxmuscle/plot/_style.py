@@ -3,7 +3,7 @@ with their units."""
 
 import functools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, ParamSpec, TypeVar, cast
 
 import matplotlib
@@ -46,12 +46,15 @@ STYLE: dict[str, Any] = {
 COLUMN = 4.4  # inches: in a column of 85 mm letters of 8 points are those of 6
 ON_DARK = 1.8  # times as strong is a grey on a dark page, to be seen as well
 LINE = 0.17  # inches
+ACROSS = 2  # panels in a row
 # from end to end of a logarithmic axis: of so few 1, 2 and 5 may leave one number only
 NARROW = 4.0
-SIZE = (COLUMN, 3.0)
 LOCK = threading.RLock()  # pyplot and rcParams are those of all threads
 PROPORTIONAL = "Proportional power (fraction per bin)"
+PER_BIN = "Power (fraction per bin)"  # beside others, where there is less room
 
+AnyFigure = Figure | SubFigure
+Style = dict[str, Any]  # of lines, areas and letters, for matplotlib's functions
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -93,11 +96,13 @@ def shade(strength: float) -> tuple[float, float, float]:
     return float(red), float(green), float(blue)
 
 
-def canvas(ax: Axes | None, size: tuple[float, float], **pads: float) -> Figure | SubFigure:
-    """What several panels are drawn into: a new figure of `size` [inches], or the place that `ax`
-    has in its figure."""
+def canvas(
+    ax: Axes | None, heights: Iterable[float], width: float = COLUMN, **pads: float
+) -> AnyFigure:
+    """What several panels are drawn into: a new figure for rows of these heights [inches], or the
+    place that `ax` has in its figure."""
     if ax is None:
-        figure = plt.figure(figsize=size, layout="constrained")
+        figure = plt.figure(figsize=(width, sum(heights)), layout="constrained")
         figure.set_layout_engine("constrained", **pads)
         return figure
     place, whole = ax.get_subplotspec(), ax.get_figure()
@@ -105,6 +110,54 @@ def canvas(ax: Axes | None, size: tuple[float, float], **pads: float) -> Figure 
         raise ValueError("ax has no place in a grid: give one made by plt.subplots or add_subplot")
     ax.remove()
     return whole.add_subfigure(place)
+
+
+def panels(
+    ax: Axes | None, layout: str, heights: Sequence[float], **shared: Any
+) -> tuple[AnyFigure, list[Axes]]:
+    """A canvas with panels as matplotlib's mosaic has them: "AA;BC" is one above two."""
+    fig = canvas(ax, heights)
+    return fig, [*fig.subplot_mosaic(layout, height_ratios=heights, **shared).values()]
+
+
+def panel_grid(
+    fig: AnyFigure, count: int, across: int = ACROSS, **shared: Any
+) -> tuple[list[Axes], np.ndarray]:
+    """So many panels, `across` of them in a row; and the whole grid, which may have had more."""
+    grid = fig.subplots(rows_for(count, across), across, squeeze=False, **shared)
+    for panel in grid.flat[count:]:
+        panel.remove()
+    return list(grid.flat[:count]), grid
+
+
+def rows_for(count: int, across: int = ACROSS) -> int:
+    """How many rows so many panels need."""
+    return -(-count // across)
+
+
+def finish(
+    fig: AnyFigure,
+    heights: Iterable[float],
+    title: str | None = None,
+    *,
+    bad: str = "",
+    columns: int = 2,
+    plain: bool = False,
+    width: float = COLUMN,
+) -> AnyFigure:
+    """The figure with its heading and its key; one of its own becomes as high as its panels and
+    these words need."""
+    lines = 0 if title is None else heading(fig, title, bad=bad)
+    return fit_height(fig, heights, lines + key(fig, columns, plain=plain), width)
+
+
+def fit_height(
+    fig: AnyFigure, heights: Iterable[float], lines: int, width: float = COLUMN
+) -> AnyFigure:
+    """A figure of its own becomes as high as its panels and so many lines of words need."""
+    if isinstance(fig, Figure):
+        fig.set_size_inches(width, sum(heights) + 0.3 + LINE * lines)
+    return fig
 
 
 def output_label(name: str, unit: str) -> str:
@@ -119,21 +172,21 @@ def density_unit(unit: str) -> str:
     return f"{unit}²/Hz" if unit.isalpha() else f"({unit.replace('^2', '²')})²/Hz"
 
 
-def named(name: str, most: int) -> str:
+def shorten(name: str, most: int) -> str:
     """A name from a file as it is drawn: in one line, and cut where it is long."""
     shown = printable(name)
     return shown if len(shown) <= most else f"{shown[: most - 1]}…"
 
 
-def heading(fig: Figure | SubFigure, words: str, *, bad: str = "") -> int:
+def heading(fig: AnyFigure, words: str, *, bad: str = "") -> int:
     """What is drawn, and below it in red what forbids to believe it; how many lines."""
-    text = "\n".join(filter(None, (named(words, 50), bad)))
+    text = "\n".join(filter(None, (shorten(words, 50), bad)))
     color = VERMILLION if bad else ink()
     fig.suptitle(text, x=0.02, ha="left", size=9, weight="bold", color=color, parse_math=False)
     return 1 + bool(bad)
 
 
-def key(fig: Figure | SubFigure, columns: int = 2, *, plain: bool = False) -> int:
+def key(fig: AnyFigure, columns: int = 2, *, plain: bool = False) -> int:
     """One legend below all panels that have none, in which each name stands once; how many lines.
 
     It has fewer columns than asked where it would be wider than the figure. `plain`, of names that
@@ -163,12 +216,6 @@ def key(fig: Figure | SubFigure, columns: int = 2, *, plain: bool = False) -> in
     return -(-len(named) // columns)
 
 
-def fitted_to(fig: Figure | SubFigure, panels: float, lines: int, width: float = COLUMN) -> None:
-    """A figure of its own becomes as high as its panels and so many lines of words need."""
-    if isinstance(fig, Figure):
-        fig.set_size_inches(width, panels + 0.3 + LINE * lines)
-
-
 def without_legend(ax: Axes) -> Axes:
     """The axes, whose names stand elsewhere."""
     own = ax.get_legend()
@@ -177,8 +224,11 @@ def without_legend(ax: Axes) -> Axes:
     return ax
 
 
-def axes_or_new(ax: Axes | None) -> Axes:
-    return plt.subplots(figsize=SIZE, layout="constrained")[1] if ax is None else ax
+def axes_or_new(ax: Axes | None, height: float = 3.0) -> Axes:
+    """The axes, or those of a new figure of that height [inches]."""
+    if ax is not None:
+        return ax
+    return plt.subplots(figsize=(COLUMN, height), layout="constrained")[1]
 
 
 def legend(ax: Axes, place: Literal["upper right", "lower left", "above"]) -> None:
@@ -199,15 +249,29 @@ def legend(ax: Axes, place: Literal["upper right", "lower left", "above"]) -> No
         ax.legend(loc=place)
 
 
-def frequency_axis(ax: Axes, log: bool) -> None:
+def frequency_axes(ax: Axes, log: bool, ordinate: str | None = None) -> None:
+    """Frequency as abscissa; linear axes begin at 0. `ordinate` is the label of the other one."""
     ax.set_xlabel("Frequency (Hz)")
-    if not log:
-        ax.set_xlim(left=0, auto=None)
-        if ax.get_yscale() == "linear":
-            ax.set_ylim(bottom=0, auto=None)
+    if ordinate is not None:
+        ax.set_ylabel(ordinate, parse_math=False)
+    if log:
+        log_axis(ax, "y")
+        log_axis(ax)
         return
-    log_axis(ax, "y")
-    log_axis(ax)
+    ax.set_xlim(left=0, auto=None)
+    if ax.get_yscale() == "linear":
+        ax.set_ylim(bottom=0, auto=None)
+
+
+def positive(frequency: np.ndarray, log: bool) -> Any:
+    """Which bins can be drawn: over a logarithmic axis all but that of the mean."""
+    return frequency > 0 if log else slice(None)
+
+
+def shade_deviations(ax: Axes) -> None:
+    """One and two standard deviations about zero, which is a line."""
+    for deviations, grey in ((2, 0.06), (1, 0.13)):
+        ax.axhspan(-deviations, deviations, color=shade(grey), lw=0, zorder=0)
 
 
 def log_axis(ax: Axes, which: Literal["x", "y"] = "x") -> None:

@@ -260,10 +260,9 @@ def posterior_report(
         summary = found.summary()
         columns = ("name", "median", "95 % interval", "unit", "R-hat", "effective sample size")
         rows: dict[bool, list[tuple[str, ...]]] = {True: [], False: []}
-        for name in summary.rows:
-            told = summary[name]
-            unit, size = _unit(summary.units[name]), min(told["ess_bulk"], told["ess_tail"])
-            rows[name in found.determined].append(
+        for name, told in summary.rows.items():
+            unit, size = _unit(told["unit"]), min(told["ess_bulk"], told["ess_tail"])
+            rows[told["determined"]].append(
                 (
                     name,
                     f"{told['median']:.4g}",

@@ -125,7 +125,7 @@ def _block(
     return _strong(_State(tuple(state.chains), tuple(state.adaptation))), made
 
 
-def _learnt(density: Density, white: np.ndarray) -> Density:
+def _whiten_anew(density: Density, white: np.ndarray) -> Density:
     """Whitened anew by the covariance of draws, the old metric counting as `SHRINK` of them."""
     count = len(white)
     covariance = (count * np.cov(white.T, bias=True) + SHRINK * np.eye(white.shape[1])) / (
@@ -136,14 +136,14 @@ def _learnt(density: Density, white: np.ndarray) -> Density:
     return eqx.tree_at(lambda m: (m.centre, m.scale), density, (centre, scale))
 
 
-def _alike(density: Density, white: np.ndarray) -> float:
+def _autocorrelation(density: Density, white: np.ndarray) -> float:
     """The largest autocorrelation of successive draws among the coordinates; axes draw, chain,
     coordinate."""
     away = (white - white.mean(axis=(0, 1))) @ np.asarray(density.scale).T
     return float(np.max(np.sum(away[1:] * away[:-1], axis=(0, 1)) / np.sum(away**2, axis=(0, 1))))
 
 
-def _moved(old: Density, new: Density, white: Array) -> np.ndarray:
+def _carry_over(old: Density, new: Density, white: Array) -> np.ndarray:
     both = np.asarray(old.centre) + np.asarray(white) @ np.asarray(old.scale).T
     return np.linalg.solve(np.asarray(new.scale), (both - np.asarray(new.centre)).T).T
 
@@ -181,7 +181,7 @@ def _sample(
     blocks = max(len(ADAPTATIONS), -(-warmup // BLOCK))
     shares = np.cumsum(ADAPTATIONS) / sum(ADAPTATIONS)
     renewals = {max(1, round(blocks * share)) for share in shares[:-1]}
-    state = _first(density, _dispersed(density, fold_in(key, 0), chains))
+    state = _first(density, _disperse(density, fold_in(key, 0), chains))
     longest = LONGEST
     recent: list[np.ndarray] = []
     kept: list[Any] = []
@@ -199,10 +199,10 @@ def _sample(
             elif number + 1 in renewals:
                 recent.append(white)
                 seen = np.concatenate(recent[-2:])
-                if number + 1 == max(renewals) and _alike(density, seen) > ALIKE:
+                if number + 1 == max(renewals) and _autocorrelation(density, seen) > ALIKE:
                     longest *= 2
-                new = _learnt(density, seen.reshape(-1, white.shape[-1]))
-                state = _first(new, _moved(density, new, state.chains[0]))
+                new = _whiten_anew(density, seen.reshape(-1, white.shape[-1]))
+                state = _first(new, _carry_over(density, new, state.chains[0]))
                 density, recent = new, []
             else:
                 recent.append(white)
@@ -215,7 +215,7 @@ def _sample(
         yield Chains(s, height, acceptance, steps, diverging, float(parts[5][-1])), density
 
 
-def _dispersed(density: Density, key: Array, chains: int) -> np.ndarray:
+def _disperse(density: Density, key: Array, chains: int) -> np.ndarray:
     """Starts about the maximum, wider than the posterior; nearer where the density is not
     finite."""
     away = SPREAD * np.asarray(_normal(key, (chains, density.size)))

@@ -21,25 +21,27 @@ from jaxmuscle.response._linearised import has_response
 from ._designs import MOST_VARIATION, Design, open_masses, segments_of
 
 VAGUE = 1e-6  # prior precision of what is separate
+Theta = Float[np.ndarray, " free"]
+Square = Float[np.ndarray, "free free"]
 
 
-def without_further(problem: FitProblem) -> FitProblem:
+def without_scalars(problem: FitProblem) -> FitProblem:
     """The problem without coefficients of variation and means as data."""
     parts = tuple(dataclasses.replace(part, variation=None, mean=None) for part in problem.parts)
     return dataclasses.replace(problem, parts=parts)
 
 
-def seen_here(problem: FitProblem, theta: Float[np.ndarray, " free"]) -> Expansion:
+def expansion_at(problem: FitProblem, theta: Theta) -> Expansion:
     """What the model gives at θ, and its slopes."""
-    return expand(without_further(problem).linear(), theta[None]).row(0)
+    return expand(without_scalars(problem).linear(), theta[None]).row(0)
 
 
-def information_of(problem: FitProblem, seen: Expansion) -> Float[np.ndarray, "free free"]:
+def information_of(problem: FitProblem, seen: Expansion) -> Square:
     """Fisher information of θ in a fit's data, at the θ where its model was seen."""
     return without_offsets(np.asarray(Likelihood.of(problem).information(seen)), len(seen.theta))
 
 
-def opened(problem: FitProblem) -> FitProblem:
+def with_open_masses(problem: FitProblem) -> FitProblem:
     """The problem with the `open_masses` free, too, after all else and with their usual prior: θ =
     0 are those of the tasks.
 
@@ -50,22 +52,23 @@ def opened(problem: FitProblem) -> FitProblem:
     if not masses:
         return problem
     first = {name: problem.parts[parts[0]].task[base_of(name)] for name, parts in masses.items()}
-    places = {name: len(c.names) + i for i, name in enumerate(masses)}
     parts = []
     for i, part in enumerate(problem.parts):
-        own = {base_of(name): place for name, place in places.items() if i in masses[name]}
+        own = {
+            base_of(name): len(c.names) + place
+            for place, (name, acting) in enumerate(masses.items())
+            if i in acting
+        }
         coordinates = _widened(part.coordinates, {name: part.task[name] for name in own})
-        parts.append(
-            dataclasses.replace(
-                part, coordinates=coordinates, columns=(*part.columns, *own.values())
-            )
-        )
+        columns = (*part.columns, *own.values())
+        parts.append(dataclasses.replace(part, coordinates=coordinates, columns=columns))
+    more = len(masses)
     return dataclasses.replace(
         problem,
         parts=tuple(parts),
         coordinates=_widened(c, first),
-        prior=np.append(problem.prior, np.ones(len(masses))),
-        damping=tuple(np.append(row, np.zeros(len(masses))) for row in problem.damping),
+        prior=np.append(problem.prior, np.ones(more)),
+        damping=tuple(np.append(row, np.zeros(more)) for row in problem.damping),
     )
 
 
@@ -74,7 +77,7 @@ def _widened(c: Coordinates, values: Mapping[str, Any]) -> Coordinates:
     rows, unbounded = [PARAMETERS[base_of(name)] for name in values], np.full(len(values), np.inf)
     return Coordinates(
         (*c.names, *values),
-        np.append(c.centre, [float(value) for value in values.values()]),
+        np.append(c.centre, [*map(float, values.values())]),
         np.append(c.sd, [row.prior_sd for row in rows]),
         np.append(c.positive, np.array([row.positive for row in rows], bool)),
         np.append(c.low, -unbounded),
@@ -82,9 +85,7 @@ def _widened(c: Coordinates, values: Mapping[str, Any]) -> Coordinates:
     )
 
 
-def design_information(
-    problem: FitProblem, theta: Float[np.ndarray, " free"], design: Design
-) -> Float[np.ndarray, "free free"]:
+def design_information(problem: FitProblem, theta: Theta, design: Design) -> Square:
     """Fisher information about a fit's θ in a design; what is separate in it is eliminated, without
     a prior of its own.
 
@@ -118,11 +119,14 @@ def design_information(
         prior=problem.prior[own],
         damping=tuple(row[own] for row in problem.damping),
     )
-    seen = seen_here(here, theta[own])
-    (moments,) = seen.moments
-    found = _information(
-        dataclasses.replace(here, parts=(_with_data(local, design, moments),)), design, seen
-    )
+    seen = expansion_at(here, theta[own])
+    with_data = _with_data(local, design, seen.moments[0])
+    likelihood = Likelihood.of(dataclasses.replace(here, parts=(with_data,)))
+    (bins,) = likelihood.bins
+    assert bins is not None
+    if not design.spectral:
+        bins = bins._replace(mask=np.zeros(len(bins.mask)))
+    found = without_offsets(np.asarray(likelihood.information(seen, (bins,))), len(own))
     if design.lengthening is not None:
         found = found + design.lengthening.information(task, coordinates, theta[own])
     whole = np.zeros((len(names), len(names)))
@@ -140,18 +144,14 @@ def coordinates_of(like: Part, theta: np.ndarray, task: Any) -> tuple[np.ndarray
     """Which of the fit's coordinates the task has, and these: the same θ stands for the task's own
     values."""
     c = like.coordinates
-    has = [
-        i
-        for i, n in enumerate(c.names)
-        if n in task.parameter_names and (float(task[n]) > 0 or not c.positive[i])
-    ]
-    own, sd, positive = np.array(like.columns, dtype=int)[has], c.sd[has], c.positive[has]
-    values, step = np.array([float(task[c.names[i]]) for i in has]), sd * theta[own]
+    values = [float(task[n]) if n in task.parameter_names else np.nan for n in c.names]
+    has = np.array(values) > np.where(c.positive, 0.0, -np.inf)
+    sd, positive, values = c.sd[has], c.positive[has], np.array(values)[has]
+    own = np.array(like.columns, dtype=int)[has]
+    step, unbounded = sd * theta[own], np.full(len(own), np.inf)
     centre = np.where(positive, values * np.exp(-step), values - step)
-    unbounded = np.full(len(own), np.inf)
-    return own, Coordinates(
-        tuple(c.names[i] for i in has), centre, sd, positive, -unbounded, unbounded
-    )
+    names = tuple(n for n, there in zip(c.names, has, strict=True) if there)
+    return own, Coordinates(names, centre, sd, positive, -unbounded, unbounded)
 
 
 def _local(like: Part, coordinates: Coordinates, task: Any, design: Design) -> Part:
@@ -177,13 +177,13 @@ def _local(like: Part, coordinates: Coordinates, task: Any, design: Design) -> P
 def _with_data(part: Part, design: Design, moments: Moments) -> Part:
     """The part with the data that the design is expected to give."""
     mean, sd = float(moments.mean), float(np.sqrt(moments.variance))
-    if (
-        design.coefficient_of_variation or design.mean is not None
-    ) and not sd < MOST_VARIATION * abs(mean):
+    relative = design.coefficient_of_variation or design.mean is not None
+    if relative and not sd < MOST_VARIATION * abs(mean):
         raise ValueError(
             f"{design.name}: the mean of its output is zero, so neither it nor a coefficient of"
             " variation can be stated relatively: leave both out"
         )
+    variation = sd / abs(mean) if design.coefficient_of_variation else None
     old = part.target
     target = Target(
         design.name,
@@ -191,21 +191,10 @@ def _with_data(part: Part, design: Design, moments: Moments) -> Part:
         bins=old.bins,
         quantity=old.quantity,
         segments=old.segments,
-        coefficient_of_variation=sd / abs(mean) if design.coefficient_of_variation else None,
+        coefficient_of_variation=variation,
         settings=old.settings,
     )
     stated = None if design.mean is None else (mean, design.mean * abs(mean))
     return dataclasses.replace(
         part, target=target, variation=target_variation(target, part.task), mean=stated
     )
-
-
-def _information(
-    problem: FitProblem, design: Design, seen: Expansion
-) -> Float[np.ndarray, "own own"]:
-    likelihood = Likelihood.of(problem)
-    (bins,) = likelihood.bins
-    assert bins is not None
-    if not design.spectral:
-        bins = bins._replace(mask=np.zeros(len(bins.mask)))
-    return without_offsets(np.asarray(likelihood.information(seen, (bins,))), len(seen.theta))

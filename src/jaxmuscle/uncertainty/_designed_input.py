@@ -5,19 +5,17 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.cards import Printed, Result
-from jaxmuscle._common.files import replacing, write_json
+from jaxmuscle._common.files import nulled, replacing, write_json
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._perturbed import MARGIN
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._derived import MEAN, TANGENTS
 
 from ._identifiability_report import BASE
-from ._lengthening import Lengthening
+from ._lengthening import Lengthening, Lines, Samples
 from ._multisine import speed_of
 
 if TYPE_CHECKING:
@@ -33,11 +31,110 @@ ENDURED = 3600.0  # s of a record
 LIMITS, SMALLER = ("peak", "speed", "acceleration"), 0.9
 MUCH, EXACT = 1.3, 0.05  # times as exact; a relative error that needs no other motion
 LOOSE = 0.33  # a third of the usual prior, 1 in the logarithm
-OPEN = (
-    "  a quantity with a larger error than about 33 % will stay 'not determined' in the fit: its"
-    " error must be at most a third of its prior's"
-)
-ASSUMED = (
+# What is printed, by what it is about.
+WORDS = {
+    "heading": (
+        "{kind} motion: one more record of {seconds:g} s would measure {best} (standard error{s})"
+    ),
+    "vague": "  so far {name} is known only to {error}{others}. {advice}",
+    "elsewhere": (
+        "  {name} may well be {may} instead of {value:.3g}{unit}. Then this record would tell it to"
+        " {to}"
+    ),
+    "gain": (
+        "  a flat motion of {rms:.3g} mm rms: {flat}. The {square} is then {gain:.2g} times as"
+        " large"
+    ),
+    "is flat": "  this motion is flat itself: no frequency is preferred",
+    "motion": (
+        "  lengthening of the muscle: {rms:.3g} mm rms, at most {peak:.3g} mm to either side,"
+        " {speed:.3g} mm/s and {acceleration:.2g} m/s², {low:.2g} to {high:.2g} Hz"
+    ),
+    "limited": (
+        "  the limit that you gave with --{limit} ({limit}=) keeps it below {rms:.3g} mm rms. A"
+        " motor that can do more{slower} makes it larger"
+    ),
+    "most": "  most of the motion: {most}",
+    "errors": (
+        "  expected standard errors, in percent of the value (prior: without any data; now: before"
+        " this record):"
+    ),
+    "open": (
+        "  a quantity with a larger error than about 33 % will stay 'not determined' in the fit:"
+        " its error must be at most a third of its prior's"
+    ),
+    "wider": (
+        "  a flat motion up to {high:g} Hz would tell {told}. If your motor can do that, design"
+        " again with --band {low:.2g}:{high:g} (band=({low:.2g}, {high:g}))"
+    ),
+    "lengths": "  the same for records of other lengths, in which the motion repeats:",
+}
+# The record that reaches the error that was asked for.
+GOAL = {
+    "no record": ("  no length of the record tells {goal}: {larger}, or choose another band"),
+    "is known": "  {goal}: what is known without this record is enough for that",
+    "at once": (
+        "  {goal}: less than {shortest:g} s of this motion would tell that. Play one period"
+    ),
+    "too long": (
+        "  to know {goal}, a record of {hours:.2g} hours would be needed, which nobody holds:"
+        " {larger}, or choose another band"
+    ),
+    "several periods": (
+        "  to know {goal}, {seconds:.3g} s of record are enough{if_so}: {periods} periods of this"
+        " motion. Play {played:.3g} s and analyse {begin:.3g} to {end:.3g} s"
+    ),
+    "shorter": (
+        "  to know {goal}, {seconds:.3g} s of record are enough{if_so}; this motion lasts"
+        " {period:.3g} s. To record less, design again with --seconds {shorter:g}"
+        " (seconds={shorter:.1f}). That is longer than {seconds:.3g} s, since a shorter motion has"
+        " fewer frequencies"
+    ),
+    "one period": (
+        "  to know {goal}, {seconds:.3g} s of record are enough{if_so}: one period of this motion."
+        " Play {played:.3g} s and analyse {begin:.3g} to {end:.3g} s"
+    ),
+}
+ADVICE = {
+    "flat": (
+        "This motion is flat, so it is a good one to begin with. Fit its record, and design again"
+        " from that fit"
+    ),
+    "designed": (
+        "That is too vague for a design. First record a minute with a flat motion (--spread 1,"
+        " spread=1.0). Fit it, and design again from that fit"
+    ),
+    "moved": (
+        "The moved record that was fitted did not tell more. So trust the errors below less, and"
+        " try a wider band or a larger motion"
+    ),
+}
+ASSUMED = {
+    "muscle": (
+        "  assumed: the muscle is the one given here{mean}. If the person is softer and the force"
+        " fluctuates as much, errors in percent are larger in proportion"
+    ),
+    "mean": (
+        ", with a mean force of {:.3g} N. If you measured another mean force, fit with it first"
+        " (mean and unit of the target)"
+    ),
+    "x_ref_w": (
+        "  assumed: the reference displacement x_ref_w. No record determines it, and the value of"
+        " K_w0 depends on it. K_w_tangent, the stiffness as displaced in the hold, hardly depends"
+        " on it (docs/perturbed.md, limits)"
+    ),
+    "m_w": (
+        "  assumed: the active mass m_w is right, as in the fit. No record determines it. A wrong"
+        " m_w makes C_w0 and K_w0 wrong, too (docs/perturbed.md has by how much)"
+    ),
+    "masses": (
+        "  assumed: {masses}, as in this fit or preset. A held force tells no mass. Is m_z your"
+        " estimate of what moves? Then go on. If not, fit with your estimate (--fix m_w={usual:g}"
+        " --fix m_z=KG) and design again. The fit of the new record leaves both masses free, and"
+        " starts them at {usual:g} kg"
+    ),
+}
+ALWAYS_ASSUMED = (
     (
         "  assumed: two parts in series answer, as in the model. If the limb answers as one spring,"
         " the record tells its stiffness (tangent_stiffness), but not that of two parts"
@@ -51,7 +148,14 @@ ASSUMED = (
         " give all trials to one fit"
     ),
 )
+HEAD = """\
+# one period of a lengthening of {seconds:g} s, to be repeated; positive: the muscle gets longer
+# rms {rms:.4g} mm, peak {peak:.4g} mm, {speed:.4g} mm/s, {acceleration:.3g} m/s^2; {made}
+time_s,displacement_mm
+"""
+NAME = "    {:<22}"  # of a quantity, before its errors
 OF_MUSCLE = (*BASE.values(), *TANGENTS)
+Errors = dict[str, float]  # of quantities, in their units
 
 
 class DesignedInput(Printed, Result, eqx.Module):
@@ -78,38 +182,38 @@ class DesignedInput(Printed, Result, eqx.Module):
     quantity: tuple[str, ...] = eqx.field(static=True)
     lengthening: Lengthening
     even: Lengthening
-    displacement: Float[np.ndarray, " samples"]
+    displacement: Samples
     rate: float
     values: dict[str, float]
     units: dict[str, str] = eqx.field(static=True)
-    now: dict[str, float]
-    flat: dict[str, float]
-    stderr: dict[str, float]
-    by_seconds: dict[float, dict[str, float]]
+    now: Errors
+    flat: Errors
+    stderr: Errors
+    by_seconds: dict[float, Errors]
     needed: tuple[float, float] | None
     notices: tuple[str, ...] = eqx.field(static=True, default=())
     elsewhere: dict[str, tuple[tuple[float, float], ...]] = eqx.field(default_factory=dict)
     masses: dict[str, float] = eqx.field(default_factory=dict)
     held: tuple[str, ...] = eqx.field(static=True, default=())
-    prior: dict[str, float] = eqx.field(default_factory=dict)
-    wider: tuple[float, dict[str, float]] | None = None
+    prior: Errors = eqx.field(default_factory=dict)
+    wider: tuple[float, Errors] | None = None
     moved: bool = eqx.field(static=True, default=False)
     allowed: tuple[float, float, float, float] = eqx.field(
         static=True, default=(0.0, np.inf, np.inf, np.inf)
     )
 
     @property
-    def time(self) -> Float[np.ndarray, " samples"]:
+    def time(self) -> Samples:
         """Time of every sample [s]."""
         return np.arange(len(self.displacement)) / self.rate
 
     @property
-    def frequency(self) -> Float[np.ndarray, " lines"]:
+    def frequency(self) -> Lines:
         """Frequencies of its lines [Hz]."""
         return self.lengthening.frequency
 
     @property
-    def density(self) -> Float[np.ndarray, " lines"]:
+    def density(self) -> Lines:
         """One-sided density of the displacement [m²/Hz]."""
         return self.lengthening.power * self.lengthening.seconds
 
@@ -148,28 +252,22 @@ class DesignedInput(Printed, Result, eqx.Module):
     def moves(self) -> tuple[tuple[float, float, float], ...]:
         """Where the density is more than twice the even one: lowest and highest frequency [Hz],
         share of the mean square."""
-        power = self.lengthening.power
+        power, f = self.lengthening.power, self.frequency
         high = np.flatnonzero(power > SHOWN * np.mean(power))
         runs = [run for run in np.split(high, np.flatnonzero(np.diff(high) > 1) + 1) if len(run)]
+        shares = (float(np.sum(power[run]) / np.sum(power)) for run in runs)
         return tuple(
-            (
-                float(self.frequency[r[0]]),
-                float(self.frequency[r[-1]]),
-                float(np.sum(power[r]) / np.sum(power)),
-            )
-            for r in runs
+            (float(f[run[0]]), float(f[run[-1]]), share)
+            for run, share in zip(runs, shares, strict=True)
         )
 
     @property
-    def told(self) -> list[str]:
+    def names(self) -> list[str]:
         """The quantities to be told of: those of the muscle, and what it was made for."""
-        return list(
-            dict.fromkeys(
-                [*self.quantity, *(n for n in self.values if n.partition("@")[0] in OF_MUSCLE)]
-            )
-        )
+        of_muscle = [n for n in self.values if n.partition("@")[0] in OF_MUSCLE]
+        return list(dict.fromkeys([*self.quantity, *of_muscle]))
 
-    def percent(self, name: str, errors: dict[str, float]) -> float:
+    def percent(self, name: str, errors: Errors) -> float:
         """A standard error in percent of the value."""
         return 100 * errors[name] / abs(self.values[name])
 
@@ -188,49 +286,46 @@ class DesignedInput(Printed, Result, eqx.Module):
         which a fit needs."""
         return self.window[1] + MARGIN
 
+    @property
+    def _size(self) -> dict[str, float]:
+        """The size of the motion in the units that are printed."""
+        return {
+            "rms": 1e3 * self.rms,
+            "peak": 1e3 * self.peak,
+            "speed": 1e3 * self.speed,
+            "acceleration": self.acceleration,
+        }
+
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings, without the signal."""
-        errors = {"prior": self.prior, "now": self.now, "flat": self.flat, "stderr": self.stderr}
-        known = {
-            n: {"value": v, "unit": self.units[n]} | {which: e[n] for which, e in errors.items()}
-            for n, v in self.values.items()
-        }
-        return {
+        own = ("rate", "rms", "peak", "speed", "acceleration")
+        errors = {which: getattr(self, which) for which in ("prior", "now", "flat", "stderr")}
+        table = {
             "format": 1,
-            "quantity": list(self.quantity),
+            "quantity": self.quantity,
             "gain": self.gain,
             "seconds": self.lengthening.seconds,
-            "rate": self.rate,
-            "rms": self.rms,
-            "peak": self.peak,
-            "speed": self.speed,
-            "acceleration": self.acceleration,
-            "by_seconds": [
-                {"seconds": seconds, "stderr": errors}
-                for seconds, errors in self.by_seconds.items()
-            ],
-            "needed": (
-                None
-                if self.needed is None
-                else {"error": self.needed[0], "seconds": with_nulls(self.needed[1])}
-            ),
-            "frequency_hz": self.frequency.tolist(),
-            "density": self.density.tolist(),
-            "quantities": known,
+            **{name: getattr(self, name) for name in own},
+            "by_seconds": [{"seconds": s, "stderr": e} for s, e in self.by_seconds.items()],
+            "needed": self.needed and dict(zip(("error", "seconds"), self.needed, strict=True)),
+            "frequency_hz": self.frequency,
+            "density": self.density,
+            "quantities": {
+                n: {"value": v, "unit": self.units[n]}
+                | {which: e[n] for which, e in errors.items()}
+                for n, v in self.values.items()
+            },
             "elsewhere": {
-                n: [
-                    {"value": with_nulls(value), "stderr": with_nulls(error)}
-                    for value, error in sides
-                ]
+                n: [dict(zip(("value", "stderr"), side, strict=True)) for side in sides]
                 for n, sides in self.elsewhere.items()
             },
-            "wider": None if self.wider is None else {"hz": self.wider[0], "stderr": self.wider[1]},
+            "wider": self.wider and dict(zip(("hz", "stderr"), self.wider, strict=True)),
             "masses": {
-                n: {"value": value, "fitted": n not in self.held}
-                for n, value in self.masses.items()
+                n: {"value": v, "fitted": n not in self.held} for n, v in self.masses.items()
             },
-            "notices": list(self.notices),
+            "notices": self.notices,
         }
+        return nulled(table)
 
     def save(self, path: str | Path) -> None:
         """Write the signal for the motor as CSV (`time_s`, `displacement_mm`); `to_dict` where the
@@ -242,16 +337,8 @@ class DesignedInput(Printed, Result, eqx.Module):
             if self.moves
             else "flat, made by jaxmuscle"
         )
-        head = (
-            f"one period of a lengthening of {self.lengthening.seconds:g} s, to be repeated;"
-            f" positive: the muscle gets longer\nrms {1e3 * self.rms:.4g} mm, peak"
-            f" {1e3 * self.peak:.4g} mm, {1e3 * self.speed:.4g} mm/s, {self.acceleration:.3g}"
-            f" m/s^2; {made}"
-        )
         with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-            file.write(
-                "".join(f"# {line}\n" for line in head.splitlines()) + "time_s,displacement_mm\n"
-            )
+            file.write(HEAD.format(seconds=self.lengthening.seconds, made=made, **self._size))
             np.savetxt(file, np.stack([self.time, 1e3 * self.displacement], axis=1), "%.7g", ",")
         return None
 
@@ -261,73 +348,87 @@ class DesignedInput(Printed, Result, eqx.Module):
         return plot.designed_input(self, ax)
 
     def __str__(self) -> str:
-        low, high = self.frequency[0], self.frequency[-1]
-        best = ", ".join(f"{n} to {_digits(self.percent(n, self.stderr))} %" for n in self.quantity)
-        flat = ", ".join(f"{_digits(self.percent(n, self.flat))} %" for n in self.quantity)
-        most = " and ".join(
-            f"{100 * share:.0f} % at {a:.2g} to {b:.2g} Hz" for a, b, share in self.moves
-        )
-        rows = [
-            f"    {n:<22}" + "".join(f"{_digits(self.percent(n, e)):>10}" for e in self._columns)
-            for n in self.told
-        ]
-        names = " and ".join(filter(None, [", ".join(self.quantity[:-1]), self.quantity[-1]]))
-        single = len(self.quantity) == 1
-        square = (
-            f"squared relative error of {names}"
-            if single
-            else f"sum of the squared relative errors of {names}"
-        )
         return folded(
             [
-                (
-                    f"{'designed' if self.moves else 'flat'} motion: one more record of"
-                    f" {self.lengthening.seconds:g} s would measure {best} (standard"
-                    f" error{'s' * (not single)})"
-                ),
-                *self._vague(),
-                *self._elsewhere(),
-                *(f"  note: {notice}" for notice in self.notices),
-                (
-                    f"  a flat motion of {1e3 * self.even.rms:.3g} mm rms: {flat}. The {square} is"
-                    f" then {self.gain:.2g} times as large"
-                    if self.moves
-                    else "  this motion is flat itself: no frequency is preferred"
-                ),
-                (
-                    f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, at most"
-                    f" {1e3 * self.peak:.3g} mm to either side, {1e3 * self.speed:.3g} mm/s and"
-                    f" {self.acceleration:.2g} m/s², {low:.2g} to {high:.2g} Hz"
-                ),
-                *self._limited(),
-                *[f"  most of the motion: {most}"] * bool(most),
-                (
-                    "  expected standard errors, in percent of the value (prior: without any data;"
-                    " now: before this record):"
-                ),
-                f"    {'':<22}{'prior':>10}{'now':>10}{'flat':>10}"
-                + f"{'designed':>10}" * bool(self.moves),
-                *rows,
-                *(
-                    [OPEN]
-                    if any(self.percent(n, self.stderr) > 100 * LOOSE for n in self.told)
-                    else []
-                ),
+                *self._heading(),
+                *self._motion(),
+                *self._table(),
                 *self._wider(),
                 *self._by_duration(),
+                *self._goal(),
                 *self._as_fitted(),
-                *ASSUMED,
+                *ALWAYS_ASSUMED,
             ]
         )
 
+    def _in_percent(self, errors: Errors, words: str = "{} to {} %") -> list[str]:
+        """The error of every quantity that it was made for."""
+        return [words.format(n, _digits(self.percent(n, errors))) for n in self.quantity]
+
+    def _heading(self) -> list[str]:
+        """What the record would tell, as the muscle is known so far, and if it is another one."""
+        lines = [
+            WORDS["heading"].format(
+                kind="designed" if self.moves else "flat",
+                seconds=self.lengthening.seconds,
+                best=", ".join(self._in_percent(self.stderr)),
+                s="s" * (len(self.quantity) > 1),
+            )
+        ]
+        if vague := self._vague:
+            (name, error), *others = vague
+            others = "".join(f", {n} to {e}" for n, e in others)
+            advice = ADVICE["moved" if self.moved else "designed" if self.moves else "flat"]
+            about = {"name": name, "error": error, "others": others, "advice": advice}
+            lines += [WORDS["vague"].format(**about)]
+        for name, sides in self.elsewhere.items():
+            unit = "" if self.units[name] == "1" else f" {self.units[name]}"
+            known = [(value, error) for value, error in sides if np.isfinite(value) and value != 0]
+            may = " or ".join(f"{value:.3g}{unit}" for value, _ in known)
+            to = " or ".join(f"{_digits(100 * error / abs(value))} %" for value, error in known)
+            about = {"name": name, "may": may, "value": self.values[name], "unit": unit, "to": to}
+            lines += [WORDS["elsewhere"].format(**about)] * bool(known)
+        return lines + [f"  note: {notice}" for notice in self.notices]
+
     @property
-    def _columns(self) -> tuple[dict[str, float], ...]:
-        """The errors that are printed; a motion that is flat itself is no other one."""
-        return (
-            (self.prior, self.now, self.flat, self.stderr)
-            if self.moves
-            else (self.prior, self.now, self.stderr)
+    def _vague(self) -> list[tuple[str, str]]:
+        """What is hardly known so far, with its error: a motion designed for it is none to begin
+        with."""
+        known = {name: self.percent(name, self.now) for name in self.quantity}
+        return [(n, f"{_digits(e)} %") for n, e in known.items() if e > 100 * DOUBTFUL]
+
+    def _motion(self) -> list[str]:
+        """The motion beside the flat one: where it moves, and what limits it."""
+        gain = "is flat"
+        about: dict[str, Any] = {}
+        if self.moves:
+            gain, names = (
+                "gain",
+                " and ".join(filter(None, [", ".join(self.quantity[:-1]), self.quantity[-1]])),
+            )
+            square = (
+                "squared relative error of"
+                if len(self.quantity) == 1
+                else "sum of the squared relative errors of"
+            )
+            flat = ", ".join(self._in_percent(self.flat, "{1} %"))
+            about = {
+                "rms": 1e3 * self.even.rms,
+                "flat": flat,
+                "square": f"{square} {names}",
+                "gain": self.gain,
+            }
+        lines = [WORDS[gain].format(**about)]
+        low, high = self.frequency[0], self.frequency[-1]
+        lines += [WORDS["motion"].format(low=low, high=high, **self._size)]
+        if (limit := self._limit) is not None:
+            slower = ", or a band with lower frequencies" * (limit in LIMITS[1:])
+            rms = 1e3 * self.allowed[0]
+            lines += [WORDS["limited"].format(limit=limit, rms=rms, slower=slower)]
+        most = " and ".join(
+            f"{100 * share:.0f} % at {a:.2g} to {b:.2g} Hz" for a, b, share in self.moves
         )
+        return lines + [WORDS["most"].format(most=most)] * bool(most)
 
     @property
     def _limit(self) -> str | None:
@@ -340,189 +441,89 @@ class DesignedInput(Printed, Result, eqx.Module):
             else None
         )
 
-    def _limited(self) -> list[str]:
-        """Why the motion is smaller than was asked for."""
-        limit = self._limit
-        slower = ", or a band with lower frequencies" * (limit in LIMITS[1:])
-        return [
-            f"  the limit that you gave with --{limit} ({limit}=) keeps it below"
-            f" {1e3 * self.allowed[0]:.3g} mm rms. A motor that can do more{slower} makes it larger"
-        ] * (limit is not None)
+    def _table(self) -> list[str]:
+        """The expected errors; a motion that is flat itself is no other one."""
+        columns = {"prior": self.prior, "now": self.now, "flat": self.stderr}
+        if self.moves:
+            columns |= {"flat": self.flat, "designed": self.stderr}
+        loose = any(self.percent(n, self.stderr) > 100 * LOOSE for n in self.names)
+        return [WORDS["errors"], *self._rows(columns), *[WORDS["open"]] * loose]
 
-    @property
-    def _larger(self) -> str:
-        """How a record gets to tell more."""
-        return (
-            "raise rms"
-            if self._limit is None
-            else f"take a motor that can do more (--{self._limit})"
-        )
+    def _rows(self, columns: dict[str, Errors]) -> list[str]:
+        """A row for each quantity, a column for each kind of error."""
+        heads = NAME.format("") + "".join(f"{head:>10}" for head in columns)
+        return [heads] + [
+            NAME.format(n)
+            + "".join(f"{_digits(self.percent(n, errors)):>10}" for errors in columns.values())
+            for n in self.names
+        ]
 
     def _wider(self) -> list[str]:
         """Whether a band twice as wide tells much more: up to 5 Hz a stiff muscle shows too little
         of its parts."""
-        if self.wider is None or all(
-            self.percent(n, self.stderr) < 100 * EXACT for n in self.quantity
-        ):
+        exact = all(self.percent(n, self.stderr) < 100 * EXACT for n in self.quantity)
+        if self.wider is None or exact:
             return []
-        if all(self.flat[n] < MUCH * self.wider[1][n] for n in self.quantity):
+        high, errors = self.wider
+        if all(self.flat[n] < MUCH * errors[n] for n in self.quantity):
             return []
-        low, high = self.frequency[0], self.wider[0]
-        told = " and ".join(
-            f"{n} to {_digits(self.percent(n, self.wider[1]))} %" for n in self.quantity
-        )
-        return [
-            f"  a flat motion up to {high:g} Hz would tell {told}. If your motor can do that,"
-            f" design again with --band {low:.2g}:{high:g} (band=({low:.2g}, {high:g}))"
-        ]
+        told = " and ".join(self._in_percent(errors))
+        return [WORDS["wider"].format(low=self.frequency[0], high=high, told=told)]
 
     def _by_duration(self) -> list[str]:
-        """The errors by the length of the record, and how long it takes to reach the one that was
-        asked for."""
-        lines = []
-        if self.by_seconds:
-            heads = "".join(f"{f'{seconds:g} s':>10}" for seconds in self.by_seconds)
-            lines += [
-                "  the same for records of other lengths, in which the motion repeats:",
-                f"    {'':<22}{heads}",
-            ]
-            lines += [
-                f"    {n:<22}"
-                + "".join(f"{_digits(self.percent(n, e)):>10}" for e in self.by_seconds.values())
-                for n in self.told
-            ]
-        if self.needed is not None:
-            error, seconds = self.needed
-            goal = f"{' and '.join(self.quantity)} to {100 * error:.3g} % (standard error)"
-            if not np.isfinite(seconds):
-                return [
-                    *lines,
-                    (
-                        f"  no length of the record tells {goal}: {self._larger}, or choose another"
-                        " band"
-                    ),
-                ]
-            if all(self.percent(name, self.now) <= 100 * error for name in self.quantity):
-                return [*lines, f"  {goal}: what is known without this record is enough for that"]
-            if seconds < SHORTEST:
-                return [
-                    *lines,
-                    (
-                        f"  {goal}: less than {SHORTEST:g} s of this motion would tell that. Play"
-                        " one period"
-                    ),
-                ]
-            if seconds > ENDURED:
-                return [
-                    *lines,
-                    (
-                        f"  to know {goal}, a record of {seconds / 3600:.2g} hours would be needed,"
-                        f" which nobody holds: {self._larger}, or choose another band"
-                    ),
-                ]
-            begin, end = self.window
-            period, periods = (
-                self.lengthening.seconds,
-                round((end - begin) / self.lengthening.seconds),
-            )
-            if_so = ", if the muscle is like the one given here" if self._vague() else ""
-            lines += [f"  to know {goal}, {seconds:.3g} s of record are enough{if_so}"]
-            if periods > 1:
-                lines[-1] += (
-                    f": {periods} periods of this motion. Play {self.played:.3g} s and analyse"
-                    f" {begin:.3g} to {end:.3g} s"
-                )
-            elif (shorter := float(np.ceil(FEWER_LINES * seconds))) < period:
-                lines[-1] += (
-                    f"; this motion lasts {period:.3g} s. To record less, design again with"
-                    f" --seconds {shorter:g} (seconds={shorter:.1f}). That is longer than"
-                    f" {seconds:.3g} s, since a shorter motion has fewer frequencies"
-                )
-            else:
-                lines[-1] += (
-                    f": one period of this motion. Play {self.played:.3g} s and analyse {begin:.3g}"
-                    f" to {end:.3g} s"
-                )
-        return lines
+        """The errors by the length of the record."""
+        columns = {f"{seconds:g} s": errors for seconds, errors in self.by_seconds.items()}
+        return [WORDS["lengths"], *self._rows(columns)] if columns else []
+
+    def _goal(self) -> list[str]:
+        """How long a record takes to reach the error that was asked for."""
+        if self.needed is None:
+            return []
+        error, seconds = self.needed
+        (begin, end), period = self.window, self.lengthening.seconds
+        periods, shorter = round((end - begin) / period), float(np.ceil(FEWER_LINES * seconds))
+        cases = {
+            "no record": not np.isfinite(seconds),
+            "is known": all(self.percent(n, self.now) <= 100 * error for n in self.quantity),
+            "at once": seconds < SHORTEST,
+            "too long": seconds > ENDURED,
+            "several periods": periods > 1,
+            "shorter": shorter < period,
+            "one period": True,
+        }
+        case = next(case for case, is_so in cases.items() if is_so)
+        about = {
+            "goal": f"{' and '.join(self.quantity)} to {100 * error:.3g} % (standard error)",
+            "larger": (
+                "raise rms"
+                if self._limit is None
+                else f"take a motor that can do more (--{self._limit})"
+            ),
+            "if_so": ", if the muscle is like the one given here" * bool(self._vague),
+            "seconds": seconds,
+            "hours": seconds / 3600,
+            "shortest": SHORTEST,
+            "shorter": shorter,
+            "played": self.played,
+        }
+        return [GOAL[case].format(begin=begin, end=end, period=period, periods=periods, **about)]
 
     def _as_fitted(self) -> list[str]:
         """What the design takes from the fit, and what to do if that is doubtful."""
         mean = [self.values[name] for name in self.values if name.partition("@")[0] == MEAN]
-        lines = [
-            "  assumed: the muscle is the one given here"
-            + f", with a mean force of {mean[0]:.3g} N" * bool(mean)
-        ]
-        if mean:
-            lines[0] += (
-                ". If you measured another mean force, fit with it first (mean and unit of the"
-                " target)"
-            )
-        lines[0] += (
-            ". If the person is softer and the force fluctuates as much, errors in percent are"
-            " larger in proportion"
-        )
-        if "K_w0" in {name.partition("@")[0] for name in self.quantity}:
-            lines += [
-                "  assumed: the reference displacement x_ref_w. No record determines it, and the"
-                " value of K_w0 depends on it. K_w_tangent, the stiffness as displaced in the hold,"
-                " hardly depends on it (docs/perturbed.md, limits)"
-            ]
-        values = " and ".join(f"{name} = {value:.3g} kg" for name, value in self.masses.items())
-        if "m_w" in self.held:
-            lines += [
-                "  assumed: the active mass m_w is right, as in the fit. No record determines it. A"
-                " wrong m_w makes C_w0 and K_w0 wrong, too (docs/perturbed.md has by how much)"
-            ]
-        elif not self.held and any(value != USUAL for value in self.masses.values()):
-            lines += [
-                f"  assumed: {values}, as in this fit or preset. A held force tells no mass. Is m_z"
-                " your estimate of what moves? Then go on. If not, fit with your estimate (--fix"
-                f" m_w={USUAL:g} --fix m_z=KG) and design again. The fit of the new record leaves"
-                f" both masses free, and starts them at {USUAL:g} kg"
-            ]
-        return lines
-
-    def _vague(self) -> list[str]:
-        """A motion designed for what is hardly known is none to begin with."""
-        known = {name: self.percent(name, self.now) for name in self.quantity}
-        vague = [
-            (name, f"{_digits(percent)} %")
-            for name, percent in known.items()
-            if percent > 100 * DOUBTFUL
-        ]
-        what = (
-            "This motion is flat, so it is a good one to begin with. Fit its record, and design"
-            " again from that fit"
-        )
-        if self.moves:
-            what = (
-                "That is too vague for a design. First record a minute with a flat motion (--spread"
-                " 1, spread=1.0). Fit it, and design again from that fit"
-            )
-        if self.moved:
-            what = (
-                "The moved record that was fitted did not tell more. So trust the errors below"
-                " less, and try a wider band or a larger motion"
-            )
-        said = [
-            f"{name} {'to' if i else 'is known only to'} {error}"
-            for i, (name, error) in enumerate(vague)
-        ]
-        return [f"  so far {', '.join(said)}. {what}"] * bool(vague)
-
-    def _elsewhere(self) -> list[str]:
-        """What the record would tell if the muscle is not as fitted, as far as that is likely."""
-        lines = []
-        for name, sides in self.elsewhere.items():
-            unit = "" if self.units[name] == "1" else f" {self.units[name]}"
-            known = [(value, error) for value, error in sides if np.isfinite(value) and value != 0]
-            may = " or ".join(f"{value:.3g}{unit}" for value, _ in known)
-            to = " or ".join(f"{_digits(100 * error / abs(value))} %" for value, error in known)
-            lines += [
-                f"  {name} may well be {may} instead of {self.values[name]:.3g}{unit}. Then this"
-                f" record would tell it to {to}"
-            ] * bool(known)
-        return lines
+        masses = " and ".join(f"{name} = {value:.3g} kg" for name, value in self.masses.items())
+        cases = {
+            "muscle": True,
+            "x_ref_w": "K_w0" in {name.partition("@")[0] for name in self.quantity},
+            "m_w": "m_w" in self.held,
+            "masses": not self.held and any(value != USUAL for value in self.masses.values()),
+        }
+        about = {
+            "mean": ASSUMED["mean"].format(*mean) if mean else "",
+            "masses": masses,
+            "usual": USUAL,
+        }
+        return [ASSUMED[case].format(**about) for case, is_so in cases.items() if is_so]
 
 
 def _digits(percent: float) -> str:

@@ -2,6 +2,7 @@
 parameters."""
 
 import dataclasses
+from collections.abc import Iterable
 
 import equinox as eqx
 import numpy as np
@@ -27,6 +28,7 @@ LONGER = 10
 # rms [m] and band [Hz] of standard perturbations; slower, force drifts
 MOVED = ((1e-4, (0.5, 10.0)), (1e-3, (0.5, 5.0)))
 MOST_VARIATION = 1e3
+MOTION = "{:g} s with the insertion moved by {:.3g} mm rms to {:.3g} Hz"
 HELD: dict[type[AbstractTask], str] = {
     Isometric: "insertion held, force measured",
     PrescribedForce: "insertion free under a constant force, displacement measured",
@@ -85,8 +87,9 @@ class Design(eqx.Module):
                 f"{self.name}: mean = {self.mean} must be a positive relative standard error,"
                 " 0.02 say"
             )
-        nothing = not self.spectral and not self.coefficient_of_variation and self.mean is None
-        if nothing and self.lengthening is None:
+        if not (
+            self.spectral or self.coefficient_of_variation or self.moves or self.mean is not None
+        ):
             raise ValueError(
                 f"{self.name}: measures nothing: give segments, coefficient_of_variation=True or"
                 " mean=0.02"
@@ -102,29 +105,32 @@ class Design(eqx.Module):
         """Whether it gives a spectrum."""
         return self.segments is None or sum(self.counts) > 0
 
-    def told(self, problem: FitProblem) -> tuple[str, str]:
+    @property
+    def moves(self) -> bool:
+        """Whether a motor moves the insertion."""
+        return self.lengthening is not None
+
+    def describe(self, problem: FitProblem) -> tuple[str, str]:
         """For the package itself:
 
         task and data in words. What the design leaves open is taken from the `problem` of a fit.
         """
-        data, like = [], self.like(problem)
+        data, like, kind = [], self.like(problem), None
+        task = like.task if self.task is None else self.task
         if self.spectral:
             settings = like.target.settings if self.settings is None else self.settings
-            data.append(_spectrum_in_words(self.counts or segments_of(like.target), settings))
-        data += ["coefficient of variation"] if self.coefficient_of_variation else []
+            data += [_spectrum_in_words(self.counts or segments_of(like.target), settings)]
+        data += ["coefficient of variation"] * self.coefficient_of_variation
         data += [] if self.mean is None else [f"mean to {100 * self.mean:.2g} %"]
-        if self.lengthening is not None:
-            task = like.task if self.task is None else self.task
+        if self.moves:
+            kind = PrescribedLength
             own = next(i for i, part in enumerate(problem.parts) if part is like)
-            open_here = [
-                base_of(name) for name, parts in open_masses(problem).items() if own in parts
-            ]
-            masses = " and ".join(name for name in open_here if name in task.parameter_names)
-            data.append(
+            opened = [base_of(n) for n, parts in open_masses(problem).items() if own in parts]
+            masses = " and ".join(name for name in opened if name in task.parameter_names)
+            data += [
                 f"response to a {self.lengthening}" + f" ({masses} {FITTED_TOO})" * bool(masses)
-            )
-        kind = None if self.lengthening is None else PrescribedLength
-        return _task_in_words(like.task if self.task is None else self.task, kind), ", ".join(data)
+            ]
+        return _task_in_words(task, kind), ", ".join(data)
 
     def like(self, problem: FitProblem) -> Part:
         """For the package itself: the part of a fit's problem that belongs to `target` (by default
@@ -141,51 +147,45 @@ class Design(eqx.Module):
         return problem.parts[0 if self.target is None else names.index(self.target)]
 
 
-def told_data(problem: FitProblem) -> tuple[str, str]:
+def describe_data(problem: FitProblem) -> tuple[str, str]:
     """Tasks and data of a fit in words."""
     tasks, told = [], []
     for part in problem.parts:
-        segments = part.target.segments
-        data = [
-            (
-                f"{len(part.target.bins)} bins with a stated sigma"
-                if segments is None
-                else _spectrum_in_words(segments, part.target.settings)
-            )
-        ]
-        data *= len(part.target.bins) > 0
-        data += ["coefficient of variation"] * (part.variation is not None) + ["mean"] * (
-            part.mean is not None
-        )
+        target, bins, data = part.target, len(part.target.bins), []
+        if bins and target.segments is not None:
+            data += [_spectrum_in_words(target.segments, target.settings)]
+        elif bins:
+            data += [f"{bins} bins with a stated sigma"]
+        data += ["coefficient of variation"] * (part.variation is not None)
+        data += ["mean"] * (part.mean is not None)
         if part.points is not None:
-            data.append(f"dynamic stiffness at {len(part.points)} frequencies")
-        whose = f"{part.name}: " if len(problem.parts) > 1 else ""
+            data += [f"dynamic stiffness at {len(part.points)} frequencies"]
+        whose = f"{part.name}: " * (len(problem.parts) > 1)
         tasks.append(whose + _task_in_words(part.task))
         told.append(whose + ", ".join(data))
     return "; ".join(tasks), "; ".join(told)
 
 
 def _task_in_words(task: AbstractTask, kind: type[AbstractTask] | None = None) -> str:
-    inputs = [
-        f"{n} = {float(task[n]):.3g} {'m' if n == 'x_z' else 'N'}"
-        for n in INPUTS
-        if n in task.parameter_names and float(task[n]) != 0
-    ]
     kind = kind or type(task)
+    inputs = [
+        f"{name} = {value:.3g} {'m' if name == 'x_z' else 'N'}"
+        for name, value in _inputs(task, INPUTS).items()
+    ]
     return ", ".join([kind.__name__ + (f" ({HELD[kind]})" if kind in HELD else ""), *inputs])
 
 
+def _inputs(task: AbstractTask, names: Iterable[str]) -> dict[str, float]:
+    """Those among these inputs of a task that are not zero."""
+    values = {name: float(task[name]) for name in names if name in task.parameter_names}
+    return {name: value for name, value in values.items() if value != 0}
+
+
 def _spectrum_in_words(counts: tuple[int, ...], settings: SpectrumSettings) -> str:
-    seconds = (
-        sum(settings.length + (count - 1) * settings.step for count in counts if count)
-        / settings.rate
-    )
-    alike = f"{len(counts)} x {max(counts)}"
-    listed = " + ".join(map(str, counts))
-    return (
-        f"spectrum of {alike if len(counts) > 2 and min(counts) == max(counts) else listed}"
-        f" segments ({seconds:.3g} s)"
-    )
+    length = sum(settings.length + (count - 1) * settings.step for count in counts if count)
+    alike = len(counts) > 2 and min(counts) == max(counts)
+    listed = f"{len(counts)} x {max(counts)}" if alike else " + ".join(map(str, counts))
+    return f"spectrum of {listed} segments ({length / settings.rate:.3g} s)"
 
 
 def segments_of(target: Target) -> tuple[int, ...]:
@@ -208,14 +208,13 @@ def designs_for(problem: FitProblem, seen: Expansion) -> tuple[Design, ...]:
     """
     if without_noise(problem):
         return ()
-    levels = [_level_of(part.task) for part in problem.parts]
-    factors = [
-        tuple(f for f, extreme in zip(LEVELS, (max, min), strict=True) if level == extreme(levels))
-        for level in levels
-    ]
+    # the first force that moves a task, 0 without one
+    levels = [next(map(abs, _inputs(part.task, FORCES).values()), 0.0) for part in problem.parts]
     designs = []
-    for part, moments, own in zip(problem.parts, seen.moments, factors, strict=True):
-        made = _designs_for(part, moments, own, _amplitudes(problem, part))
+    for part, moments, level in zip(problem.parts, seen.moments, levels, strict=True):
+        ends = zip(LEVELS, (max(levels), min(levels)), strict=True)
+        factors = [factor for factor, extreme in ends if level == extreme]
+        made = _designs_for(part, moments, factors, _amplitudes(problem, part))
         if len(problem.parts) > 1:
             made = [
                 dataclasses.replace(d, name=f"{d.name} ({part.name})", target=part.name)
@@ -231,14 +230,6 @@ def without_noise(problem: FitProblem) -> bool:
     return any(len(part.target.bins) == 0 for part in problem.parts)
 
 
-def _level_of(task: AbstractTask) -> float:
-    """The first force that moves a task, 0 without one."""
-    return next(
-        (abs(float(task[n])) for n in FORCES if n in task.parameter_names and float(task[n]) != 0),
-        0.0,
-    )
-
-
 def _amplitudes(problem: FitProblem, part: Part) -> tuple[str, ...]:
     """Free amplitudes of a part's noise and harmonic, by their names in the fit."""
     own = dict(zip(part.coordinates.names, part.columns, strict=True))
@@ -246,59 +237,42 @@ def _amplitudes(problem: FitProblem, part: Part) -> tuple[str, ...]:
 
 
 def _designs_for(
-    part: Part, moments: Moments, factors: tuple[float, ...], separate: tuple[str, ...]
+    part: Part, moments: Moments, factors: list[float], separate: tuple[str, ...]
 ) -> list[Design]:
     """Of one target: what it does not state, the other output, a moved insertion, other force
     levels, a longer recording."""
-    task, mean = part.task, float(moments.mean)
+    task, mean, settings = part.task, float(moments.mean), part.target.settings
+    # else the output fluctuates about zero, and nothing is relative to its mean
     steady = float(np.sqrt(moments.variance)) < MOST_VARIATION * abs(mean)
-    varying = part.variation is not None
-    still = "" if part.points is None else ", without motion"
+    varying, still = part.variation is not None, ", without motion" * (part.points is not None)
     designs = []
     if not varying and steady:
-        designs.append(
-            Design("the coefficient of variation", segments=0, coefficient_of_variation=True)
-        )
+        name = "the coefficient of variation"
+        designs += [Design(name, segments=0, coefficient_of_variation=True)]
     if part.mean is None and steady:
-        designs.append(
-            Design(
-                f"the mean {task.quantity}, known to {100 * MEAN_ERROR:g} %",
-                segments=0,
-                mean=MEAN_ERROR,
-            )
-        )
+        name = f"the mean {task.quantity}, known to {100 * MEAN_ERROR:g} %"
+        designs += [Design(name, segments=0, mean=MEAN_ERROR)]
     if isinstance(task, Isometric):
-        held = task.as_task(PrescribedForce, P_w=task.P_w, F_ext=mean)
-        designs.append(Design(f"the displacement under a load of {mean:.3g} N", held))
+        loaded = task.as_task(PrescribedForce, P_w=task.P_w, F_ext=mean)
+        designs += [Design(f"the displacement under a load of {mean:.3g} N", loaded)]
     if isinstance(task, PrescribedLength):
+        motions = (Lengthening.flat(*given) for given in MOVED)
         designs += [
-            moved_insertion(
-                Lengthening.flat(*given), part.target.settings, coefficient_of_variation=steady
-            )
-            for given in MOVED
+            moved_insertion(one, settings, coefficient_of_variation=steady) for one in motions
         ]
     if isinstance(task, PrescribedForce):
-        fixed = task.as_task(Isometric, P_w=task.P_w)
-        designs.append(
-            Design("the force with the insertion held", fixed, coefficient_of_variation=True)
-        )
-    forces = {
-        n: float(task[n]) for n in FORCES if n in task.parameter_names and float(task[n]) != 0
-    }
-    if forces:
-        for factor in (f for f in factors if f * (part.target.mvc_fraction or 0.0) <= 1.0):
+        name, fixed = "the force with the insertion held", task.as_task(Isometric, P_w=task.P_w)
+        designs += [Design(name, fixed, coefficient_of_variation=True)]
+    forces = _inputs(task, FORCES)
+    for factor in factors if forces else ():
+        if factor * (part.target.mvc_fraction or 0.0) <= 1.0:
             name = f"a second force level {factor:g} times as high{still}"
-            moved = task.replace(**{n: factor * v for n, v in forces.items()})
-            designs.append(Design(name, moved, coefficient_of_variation=varying, separate=separate))
+            moved = task.replace(**{n: factor * force for n, force in forces.items()})
+            about = {"coefficient_of_variation": varying, "separate": separate}
+            designs += [Design(name, moved, **about)]
     more = tuple((LONGER - 1) * k for k in segments_of(part.target))
-    designs.append(
-        Design(
-            f"a recording {LONGER} times as long{still}",
-            segments=more,
-            coefficient_of_variation=varying,
-        )
-    )
-    return designs
+    name = f"a recording {LONGER} times as long{still}"
+    return [*designs, Design(name, segments=more, coefficient_of_variation=varying)]
 
 
 def moved_insertion(
@@ -310,14 +284,10 @@ def moved_insertion(
 ) -> Design:
     """A recording with the insertion moved: its response, and the spectrum of the fluctuations
     beside it."""
-    top = lengthening.frequency[-1]
-    name = (
-        f"{lengthening.seconds:g} s with the insertion moved by {1e3 * lengthening.rms:.3g} mm rms"
-        f" to {top:.3g} Hz"
-    )
-    segments = settings.segments(round(lengthening.seconds * settings.rate))
+    seconds, top = lengthening.seconds, lengthening.frequency[-1]
+    segments = settings.segments(round(seconds * settings.rate))
     return Design(
-        name,
+        MOTION.format(seconds, 1e3 * lengthening.rms, top),
         segments=segments,
         coefficient_of_variation=coefficient_of_variation and segments > 0,
         lengthening=lengthening,

@@ -3,11 +3,10 @@
 import dataclasses
 import itertools
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.errors import OperatingPointError
@@ -23,13 +22,15 @@ from jaxmuscle.objective._derived import MEAN, unit_of
 from jaxmuscle.objective._problem import FitProblem
 
 from ._design_information import (
+    Square,
+    Theta,
     design_information,
+    expansion_at,
     information_of,
-    opened,
-    seen_here,
-    without_further,
+    with_open_masses,
+    without_scalars,
 )
-from ._designs import Design, designs_for, told_data, without_noise
+from ._designs import Design, describe_data, designs_for, without_noise
 from ._identifiability_report import (
     NO_NOISE,
     TOGETHER,
@@ -39,7 +40,12 @@ from ._identifiability_report import (
     Outlook,
 )
 
-LEAST_PRIOR = 1e-6
+LEAST_PRIOR = 1e-6  # precision of what has no prior, which would have no variance before the data
+MISSED = (
+    UNDESCRIBED + " (chi2 {0.chi2:.3g}, expected {0.expected:.3g}). What follows assumes that the"
+    " model holds. The errors here are not widened; those of the fit are, by a factor of"
+    " {0.widening:.2g}. What to do: find a model that describes the data first"
+)
 
 
 def identifiability(
@@ -74,77 +80,56 @@ def identifiability(
         moves = (
             any(isinstance(p.task, PrescribedLength) for p in fitted.parts)
             if tried is None
-            else any(map(_moved, tried))
+            else any(design.moves for design in tried)
         )
-        problem = opened(fitted) if moves else fitted
+        problem = with_open_masses(fitted) if moves else fitted
         theta = np.append(at, np.zeros(len(problem.prior) - len(at)))
-        seen = seen_here(problem, theta)
+        seen = expansion_at(problem, theta)
         tried = designs_for(fitted, seen) if tried is None else tried
         names = [design.name for design in tried]
-        if len(set(names)) < len(names):
-            raise ValueError(
-                f"designs: two are called {next(n for n in names if names.count(n) > 1)!r}:"
-                " rename one"
-            )
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"designs: two are called {name!r}: rename one")
         here = Here.of(problem, seen, result.derived_names, len(at))
-        added = [_added(problem, theta, design) for design in tried]
-    present = here.outlook("the present data", here.information, *told_data(fitted))
-    alone = tuple(
-        here.outlook(
-            d.name,
-            here.information + more,
-            *d.told(fitted),
-            d.separate,
-            failed,
-            present,
-            masses=_moved(d),
-        )
-        for d, (more, failed) in zip(tried, added, strict=True)
-    )
-    possible = [
-        (d.name, _moved(d), more)
-        for d, (more, failed) in zip(tried, added, strict=True)
-        if failed is None
-    ]
+        added = [_information_in(problem, theta, design) for design in tried]
+    task, data = describe_data(fitted)
+    present = here.outlook(0.0, name="the present data", task=task, data=data)
+    alone = []
+    for design, (more, failed) in zip(tried, added, strict=True):
+        task, data = design.describe(fitted)
+        about = {"task": task, "data": data, "separate": design.separate, "failed": failed}
+        alone += [here.outlook(more, present, design.moves, name=design.name, **about)]
+    possible = [(d, x) for d, (x, failed) in zip(tried, added, strict=True) if failed is None]
     pairs = [
-        here.outlook(a + TOGETHER + b, here.information + x + y, present=present, masses=m or n)
-        for (a, m, x), (b, n, y) in itertools.combinations(possible, 2)
+        here.outlook(x + y, present, a.moves or b.moves, name=a.name + TOGETHER + b.name)
+        for (a, x), (b, y) in itertools.combinations(possible, 2)
     ]
     pairs.sort(key=lambda pair: (-len(pair.gained), pair.log_left))
     notices = tuple(n for n in result.notices if " ambiguous: " in n)
-    if designs is None and without_noise(fitted):
-        notices += (NO_NOISE,)
-    if target is None:
-        notices = missed(result) + notices
-    mean_force = result.derived[MEAN].value if result.per_newton else None
+    notices += (NO_NOISE,) * (designs is None and without_noise(fitted))
     # Of another target the fit has said nothing.
-    found = {} if target is not None else result.found
+    found = result.found if target is None else {}
     known = {n for n, k in present.quantities.items() if k.determined}
-    doubted = tuple(n for n, p in found.items() if n in known and p.stderr is None)
     first, names = fitted.parts[0].task, fitted.coordinates.names
-    masses = {n: float(first[n]) for n in MASSES if n in first.parameter_names and n not in names}
     return IdentifiabilityReport(
-        fitted.title, names, present, alone, tuple(pairs), notices, mean_force, doubted, masses
+        fitted.title,
+        names,
+        present,
+        tuple(alone),
+        tuple(pairs),
+        (misfit_notices(result) if target is None else ()) + notices,
+        result.derived[MEAN].value if result.per_newton else None,
+        tuple(n for n, p in found.items() if n in known and p.stderr is None),
+        {n: float(first[n]) for n in MASSES if n in first.parameter_names and n not in names},
     )
 
 
-def _moved(design: Design) -> bool:
-    return design.lengthening is not None
-
-
-def missed(result: FitResult) -> tuple[str, ...]:
+def misfit_notices(result: FitResult) -> tuple[str, ...]:
     """What has to be said before a plan that stands on a fit whose model misses the data."""
     found = result.adequacy
     if found is None or found.adequate:
         return ()
-    return (
-        (
-            f"{UNDESCRIBED} (chi2 {found.chi2:.3g}, expected {found.expected:.3g}). What follows"
-            " assumes that the model holds. The errors here are not widened; those of the fit are,"
-            f" by a factor of {found.widening:.2g}. What to do: find a model that describes the"
-            " data first"
-        ),
-    )
+    return (MISSED.format(found),)
 
 
 def standard_designs(result: FitResult, target: Target | None = None) -> tuple[Design, ...]:
@@ -165,12 +150,10 @@ def standard_designs(result: FitResult, target: Target | None = None) -> tuple[D
     """
     with fitting():
         problem, theta = fitted_problem(result, target)
-        return designs_for(problem, seen_here(problem, theta))
+        return designs_for(problem, expansion_at(problem, theta))
 
 
-def fitted_problem(
-    result: FitResult, target: Target | None
-) -> tuple[FitProblem, Float[np.ndarray, " free"]]:
+def fitted_problem(result: FitResult, target: Target | None) -> tuple[FitProblem, Theta]:
     """The fit's problem with the fitted tasks in it, and θ."""
     problem, tasks = reopened(result, target), tuple(result.tasks.values())
     parts = (
@@ -180,7 +163,7 @@ def fitted_problem(
     return dataclasses.replace(problem, parts=tuple(parts)), problem.theta_of(tasks)
 
 
-def _added(problem: FitProblem, theta: np.ndarray, design: Design) -> tuple[np.ndarray, str | None]:
+def _information_in(problem: FitProblem, theta: Theta, design: Design) -> tuple[Square, str | None]:
     """What a design tells, or why it is impossible."""
     try:
         return design_information(problem, theta, design), None
@@ -192,14 +175,14 @@ class Here(NamedTuple):
     """The fit: information of its data, its prior, values and gradients of what can be known.
 
     The first `free` of the coordinates are those that the fit has free; the others are masses, see
-    `opened`.
+    `with_open_masses`.
     """
 
     coordinates: Coordinates
-    information: np.ndarray
-    prior: np.ndarray
+    information: Square
+    prior: Square
     values: dict[str, tuple[float, str]]
-    gradients: dict[str, np.ndarray]
+    gradients: dict[str, Theta]
     free: int
 
     @classmethod
@@ -211,68 +194,43 @@ class Here(NamedTuple):
         natural = c.values_of(np.asarray(seen.theta)[None])[0]
         values = {n: (float(v), unit_of(n)) for n, v in zip(c.names, natural, strict=True)}
         gradients = dict(zip(c.names, np.diag(c.slope(natural)), strict=True))
-        tables = quantities(
-            without_further(problem).linear(), jax.tree.map(lambda x: np.asarray(x)[None], seen)
-        )
+        rows = jax.tree.map(lambda x: np.asarray(x)[None], seen)
+        tables = quantities(without_scalars(problem).linear(), rows)
         free = len(c.names) if free is None else free
         for name in derived:
             part, quantity = problem.where(name)
             value, g = (table[part][quantity][0] for table in tables)
-            if (
-                name not in values
-                and np.all(np.isfinite(g))
-                and np.any(g[:free] != 0)
-                and np.isfinite(value)
-            ):
+            finite = np.isfinite(value) and np.all(np.isfinite(g))
+            if name not in values and finite and np.any(g[:free] != 0):
                 unit = unit_of(name, problem.parts[part].task.output_unit)
                 values[name], gradients[name] = (float(value), unit), g
         return cls(c, information_of(problem, seen), problem.precision, values, gradients, free)
 
     def outlook(
-        self,
-        name: str,
-        information: np.ndarray,
-        task: str = "",
-        data: str = "",
-        separate: tuple[str, ...] = (),
-        failed: str | None = None,
-        present: Outlook | None = None,
-        *,
-        masses: bool = False,
+        self, more: Any, present: Outlook | None = None, masses: bool = False, **about: Any
     ) -> Outlook:
-        """What is known with that information; the further masses are known, too, unless they are
-        asked to be open."""
-        size = len(self.prior) if masses else self.free
-        after = np.linalg.pinv(information[:size, :size] + self.prior[:size, :size], hermitian=True)
-        every, found = (Identifiability.of_covariance(after[:n, :n]) for n in (size, self.free))
-        before = np.linalg.inv(self.prior[:size, :size] + LEAST_PRIOR * np.eye(size))
-        c, known = self.coordinates, {}
-        for n in (n for n in self.gradients if n not in c.names[self.free :]):
-            g = self.gradients[n][:size]
-            left, had = g @ after @ g, g @ before @ g
-            known[n] = Known(
-                *self.values[n], float(np.sqrt(left)), float(np.sqrt(had)), every.determines(g)
-            )
-        gained = (
-            ()
-            if present is None
-            else tuple(
-                n for n, k in known.items() if k.determined and not present.quantities[n].determined
-            )
-        )
-        names, after = c.names[: self.free], after[: self.free, : self.free]
-        products = known_products(names, c.positive[: self.free], c.sd[: self.free], found)
-        errors = {n: float(np.sqrt(g @ after @ g)) for n, g in products.items()}
+        """What is known with `more` information; the further masses are known, too, unless they are
+        asked to be open. `about`, the design in words."""
+        size, free, c = len(self.prior) if masses else self.free, self.free, self.coordinates
+        own = np.s_[:size, :size]
+        after = np.linalg.pinv((self.information + more + self.prior)[own], hermitian=True)
+        before = np.linalg.inv(self.prior[own] + LEAST_PRIOR * np.eye(size))
+        every, found = (Identifiability.of_covariance(after[:n, :n]) for n in (size, free))
+        known = {}
+        for n in self.gradients:
+            if n not in c.names[free:]:
+                g = self.gradients[n][:size]
+                left, had = (float(np.sqrt(g @ each @ g)) for each in (after, before))
+                known[n] = Known(*self.values[n], left, had, every.determines(g))
+        had = known if present is None else present.quantities
+        names, inner = c.names[:free], after[:free, :free]
+        products = known_products(names, c.positive[:free], c.sd[:free], found)
         return Outlook(
-            name,
-            task,
-            data,
-            separate,
-            found.singular_values,
-            int(found.determined.sum()),
-            common_scales(names, found),
-            errors,
-            known,
-            gained,
-            failed,
+            singular_values=found.singular_values,
+            determined=int(found.determined.sum()),
+            undetermined=common_scales(names, found),
+            products={n: float(np.sqrt(g @ inner @ g)) for n, g in products.items()},
+            quantities=known,
+            gained=tuple(n for n, k in known.items() if k.determined and not had[n].determined),
+            **about,
         )

@@ -1,6 +1,7 @@
 """The identifiability report: what is known now, what it would be with further measurements, in
 words and tables."""
 
+import dataclasses
 import re
 import textwrap
 from collections.abc import Iterable
@@ -13,7 +14,7 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Printed, Result
-from jaxmuscle._common.files import write_json
+from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
 from jaxmuscle.fits._part import ALIASES, RELATIVE, in_use
@@ -31,22 +32,49 @@ PAIRS_TOLD = 3
 TOGETHER = " together with "
 SAME = 1e-6
 FAR = 999  # percent
-STRICTER = (
-    "The fit is stricter: it also looks for other solutions, and at combinations that are open."
-    " Believe the fit"
-)
-TIRING = (
-    "fatigue is not considered: split a long or strong hold into short trials with rests between,"
-    " and give all trials to one fit"
-)
+Names = tuple[str, ...]
+# What is printed, by what it is about.
+WORDS = {
+    "heading": "what the data of {target} determine",
+    "combinations": (
+        "{count} of {free} combinations of the parameters are determined: those left of the bar,"
+        " with a singular value of {threshold:g} or more"
+    ),
+    "products": "determined parameters, products and ratios, with standard errors: {products}",
+    "doubted": (
+        "known here, but not determined in the fit: {names}. The fit is stricter: it also looks for"
+        " other solutions, and at combinations that are open. Believe the fit"
+    ),
+    "most": "most would be learnt from {what}: {rest}",
+    "open": "{count} of {free} combinations would stay open",
+    "closed": "nothing would stay open",
+    "single": ". If you make only one: {letter} ({count} would stay open)",
+    "design": "{design} ({count} of {free} combinations determined)",
+    "tiring": (
+        "fatigue is not considered: split a long or strong hold into short trials with rests"
+        " between, and give all trials to one fit"
+    ),
+    "separate": "; with its own {values} of {names}",
+    "errors": (
+        "standard errors in percent of the value. In brackets: not determined, since about a third"
+        " or more of the error without data is left{doubted}. >>: {far} % or more. prior: without"
+        " data. now: with the data of the fit{added}"
+    ),
+    "also doubted": "; in the column now also what the fit does not call determined",
+    "added": ". A, B, ...: with that measurement added",
+    "per newton": (
+        "no mean force in newtons was given: forces, stiffness and damping are stated per newton of"
+        " mean force (that of the fitted muscle is {force:.3g} N)"
+    ),
+    "masses": "taken as known, as in the fit: {masses}{opened}",
+    "opened": "; but fitted in those measurements whose details say so",
+}
 NO_NOISE = (
     "no further measurement is tried: the fit has no spectrum, so the noise that limits a"
     " measurement is not known. Fit the recording of both channels, or a spectrum beside the"
     " response (fit_joint)"
 )
 FITTED_TOO = "fitted in this measurement"
-DOUBTED = "; in the column now also what the fit does not call determined"
-OPENED = "; but fitted in those measurements whose details say so"
 BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
 
 
@@ -70,14 +98,7 @@ class Known(eqx.Module):
 
     def row(self) -> dict[str, Any]:
         """As columns of a table."""
-        return {
-            "value": self.value,
-            "unit": self.unit,
-            "stderr": self.stderr,
-            "prior_sd": self.prior_sd,
-            "left": self.left,
-            "determined": self.determined,
-        }
+        return dataclasses.asdict(self) | {"left": self.left}
 
     @property
     def percent(self) -> str:
@@ -103,16 +124,16 @@ class Outlook(Printed, Result, eqx.Module):
     """
 
     name: str
-    task: str
-    data: str
-    separate: tuple[str, ...]
     singular_values: Float[np.ndarray, " free"]
     determined: int
-    undetermined: tuple[str, ...]
+    undetermined: Names
     products: dict[str, float]
     quantities: dict[str, Known]
-    gained: tuple[str, ...]
-    failed: str | None
+    gained: Names
+    task: str = ""
+    data: str = ""
+    separate: Names = ()
+    failed: str | None = None
 
     @property
     def log_left(self) -> float:
@@ -123,30 +144,17 @@ class Outlook(Printed, Result, eqx.Module):
     def __str__(self) -> str:
         if self.failed is not None:
             return f"{self.name} is impossible: {self.failed}"
-        names = sorted(
-            set(self.gained) & set(told(self.quantities)), key=lambda n: self.quantities[n].left
-        )
-        if not names:
+        gained = [name for name in names_to_show(self.quantities) if name in self.gained]
+        gained.sort(key=lambda name: self.quantities[name].left)
+        if not gained:
             return f"{self.name} would determine no further quantity"
-        parts = [f"{n} to {self.quantities[n].percent}" for n in names]
-        listed = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-        return f"{self.name} would determine {listed}"
+        *most, last = (f"{name} to {self.quantities[name].percent}" for name in gained)
+        return f"{self.name} would determine {' and '.join(filter(None, (', '.join(most), last)))}"
 
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings."""
-        return {
-            "name": self.name,
-            "task": self.task,
-            "data": self.data,
-            "separate": list(self.separate),
-            "failed": self.failed,
-            "singular_values": self.singular_values.tolist(),
-            "determined": self.determined,
-            "undetermined": list(self.undetermined),
-            "products": self.products,
-            "gained": list(self.gained),
-            "quantities": {n: k.row() for n, k in self.quantities.items()},
-        }
+        rows = {name: known.row() for name, known in self.quantities.items()}
+        return nulled(dataclasses.asdict(self)) | {"quantities": rows}
 
 
 UNDESCRIBED = "the fit does not describe its data"
@@ -164,13 +172,13 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
     """
 
     target: str
-    free: tuple[str, ...]
+    free: Names
     present: Outlook
     designs: tuple[Outlook, ...]
     pairs: tuple[Outlook, ...]
-    notices: tuple[str, ...]
+    notices: Names
     mean_force: float | None = None
-    open_in_fit: tuple[str, ...] = ()
+    open_in_fit: Names = ()
     masses: dict[str, float] = eqx.field(default_factory=dict)
 
     @property
@@ -191,16 +199,13 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
     @property
     def doubt(self) -> str:
         """What stands in red above the figure: nothing, or that the fit misses its data."""
-        return (
-            "The fit does not describe its data"
-            if any(n.startswith(UNDESCRIBED) for n in self.notices)
-            else ""
-        )
+        undescribed = any(notice.startswith(UNDESCRIBED) for notice in self.notices)
+        return "The fit does not describe its data" * undescribed
 
     @property
-    def told(self) -> list[str]:
+    def names(self) -> list[str]:
         """Names of the quantities that tables and figures show."""
-        return told(self.present.quantities)
+        return names_to_show(self.present.quantities)
 
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings."""
@@ -220,14 +225,14 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row for each design ("" is the present data) and quantity.
 
-        Columns: `design`, `quantity`, `value`, `unit`, `stderr`, `prior_sd`, the share `left` of
-        it, `determined`.
+        Columns: `design`, `quantity`, `value`, `unit`, `stderr`, `prior_sd`, `determined`, and
+        `left`, the share of the prior's standard deviation that is left.
         """
-        known = {"": self.present, **{o.name: o for o in (*self.designs, *self.pairs)}}
+        known = [("", self.present), *((o.name, o) for o in (*self.designs, *self.pairs))]
         return frame(
             [
                 {"design": design, "quantity": name, **quantity.row()}
-                for design, outlook in known.items()
+                for design, outlook in known
                 for name, quantity in outlook.quantities.items()
             ]
         )
@@ -244,24 +249,22 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
         return "\n".join([*_present(self), *_next(self), *_table(self), *_details(self)])
 
 
-def told(quantities: dict[str, Known]) -> list[str]:
+def names_to_show(quantities: dict[str, Known]) -> list[str]:
     """The quantities to be told of: K_j0 and C_j0 stand for the k_j and c_j to which they are
     proportional.
 
     What has two names, as the tremor's frequency, is told by the one that people use.
     """
-    twins = {
-        k: base for k, base in (BASE | ALIASES).items() if k in quantities and base in quantities
-    }
-    doubled = {
-        k for k, base in twins.items() if abs(quantities[k].left - quantities[base].left) < SAME
-    }
+    left = {name: known.left for name, known in quantities.items()}
+    twins = {k: base for k, base in (BASE | ALIASES).items() if k in left and base in left}
+    doubled = {k for k, base in twins.items() if abs(left[k] - left[base]) < SAME}
     return [name for name in quantities if name not in doubled]
 
 
 def letter(number: int) -> str:
     """A, B, ... Z, A1, B1, ..."""
-    return chr(ord("A") + number % 26) + (str(number // 26) if number >= 26 else "")
+    again, place = divmod(number, 26)
+    return chr(ord("A") + place) + (str(again) if again else "")
 
 
 def _wrapped(text: str, indent: int, first: str | None = None) -> list[str]:
@@ -276,30 +279,29 @@ def _wrapped(text: str, indent: int, first: str | None = None) -> list[str]:
     )
 
 
+def _item(text: str) -> list[str]:
+    """A sentence of the report, two columns further in than its heading."""
+    return _wrapped(text, 4, "  ")
+
+
 def _present(report: IdentifiabilityReport) -> list[str]:
-    now = report.present
-    lines = _wrapped(f"what the data of {report.target} determine", 2, "")
+    now, count = report.present, report.present.determined
+    lines = _wrapped(WORDS["heading"].format(target=report.target), 2, "")
     lines += _wrapped(f"{now.task}; {now.data}", 2)
     for notice in report.notices:
         lines += _wrapped(notice, 4, "  note: ")
-    lines += _wrapped(
-        f"{now.determined} of {len(report.free)} combinations of the parameters are determined:"
-        f" those left of the bar, with a singular value of {DETERMINED:g} or more",
-        4,
-        "  ",
-    )
+    about = {"count": count, "free": len(report.free), "threshold": DETERMINED}
+    lines += _item(WORDS["combinations"].format(**about))
     values = [f"{v:.3g}" for v in now.singular_values]
-    lines += _wrapped("  ".join([*values[: now.determined], "|", *values[now.determined :]]), 4)
+    lines += _wrapped("  ".join([*values[:count], "|", *values[count:]]), 4)
     if now.products:
-        lines += _wrapped(
-            f"determined parameters, products and ratios, with standard errors: {_products(now)}",
-            4,
-            "  ",
+        products = ", ".join(
+            f"{_as_people_say(name)} (± {100 * error:.2g} %)"
+            for name, error in now.products.items()
         )
-    if doubted := [name for name in told(now.quantities) if name in report.open_in_fit]:
-        lines += _wrapped(
-            f"known here, but not determined in the fit: {', '.join(doubted)}. {STRICTER}", 4, "  "
-        )
+        lines += _item(WORDS["products"].format(products=products))
+    if doubted := [name for name in names_to_show(now.quantities) if name in report.open_in_fit]:
+        lines += _item(WORDS["doubted"].format(names=", ".join(doubted)))
     if now.undetermined:
         lines += ["  the data leave open:"]
         for sentence in now.undetermined:
@@ -312,13 +314,6 @@ def _as_people_say(product: str) -> str:
     return re.sub(r"\w+", lambda word: in_use(word[0]) or word[0], spelt(product))
 
 
-def _products(outlook: Outlook) -> str:
-    return ", ".join(
-        f"{_as_people_say(name)} (± {100 * error:.2g} %)"
-        for name, error in outlook.products.items()
-    )
-
-
 def _next(report: IdentifiabilityReport) -> list[str]:
     """The answer before its details: what each measurement would tell, and which one tells most."""
     if not report.designs:
@@ -327,47 +322,41 @@ def _next(report: IdentifiabilityReport) -> list[str]:
     lines = ["  what to measure next:"]
     if (best := _most(report, (*report.designs, *report.pairs))) is not None:
         count = free - best.determined
-        rest = (
-            f"{count} of {free} combinations would stay open"
-            if count
-            else "nothing would stay open"
-        )
-        letters = _letters(report, best)
-        if len(letters) > 1 and (single := _most(report, report.designs)) is not None:
-            rest += (
-                f". If you make only one: {_letters(report, single)[0]} ({free - single.determined}"
-                " would stay open)"
-            )
-        both = zip(letters, best.name.split(TOGETHER), strict=False)
-        what = (
-            f"{letters[0]}, {best.name}"
-            if len(letters) == 1
-            else TOGETHER.join(f"{at} ({name})" for at, name in both)
-        )
-        lines += _wrapped(f"most would be learnt from {what}: {rest}", 4)
+        rest = WORDS["open" if count else "closed"].format(count=count, free=free)
+        named = dict(zip(_letters(report, best), best.name.split(TOGETHER), strict=False))
+        what = ", ".join([*named, best.name])
+        if len(named) > 1:
+            what = TOGETHER.join(f"{at} ({name})" for at, name in named.items())
+            if (single := _most(report, report.designs)) is not None:
+                (first,), count = _letters(report, single), free - single.determined
+                rest += WORDS["single"].format(letter=first, count=count)
+        lines += _wrapped(WORDS["most"].format(what=what, rest=rest), 4)
     for number, design in enumerate(report.designs):
-        count = "" if design.failed else f" ({design.determined} of {free} combinations determined)"
-        lines += _wrapped(f"{design}{count}", 8, f"    {letter(number):<2}  ")
+        words = "{design}" if design.failed else WORDS["design"]
+        about = {"design": design, "count": design.determined, "free": free}
+        lines += _wrapped(words.format(**about), 8, f"    {letter(number):<2}  ")
     for pair in report.telling_pairs[:PAIRS_TOLD]:
         label = "+".join(_letters(report, pair))
         lines += _wrapped(str(pair).replace(pair.name, "both together"), 8, f"    {label:<3} ")
-    return lines + _wrapped(TIRING, 4)
+    return lines + _wrapped(WORDS["tiring"], 4)
 
 
 def _letters(report: IdentifiabilityReport, outlook: Outlook) -> list[str]:
     """The letters of a design, or of the two of a pair."""
-    alone = [letter(i) for i, design in enumerate(report.designs) if design.name == outlook.name]
-    return alone or [
-        letter(i) for i, d in enumerate(report.designs) if d.name in outlook.name.split(TOGETHER)
-    ]
+    letters = {design.name: letter(i) for i, design in enumerate(report.designs)}
+    names = [outlook.name] if outlook.name in letters else outlook.name.split(TOGETHER)
+    return [at for name, at in letters.items() if name in names]
 
 
 def _details(report: IdentifiabilityReport) -> list[str]:
     """Task and data of each measurement."""
     lines = ["  the measurements in detail:"] if report.designs else []
     for number, design in enumerate(report.designs):
-        values = "values" if len(design.separate) > 1 else "value"
-        own = f"; with its own {values} of {', '.join(design.separate)}" if design.separate else ""
+        values, names = (
+            "values" if len(design.separate) > 1 else "value",
+            ", ".join(design.separate),
+        )
+        own = WORDS["separate"].format(values=values, names=names) * bool(design.separate)
         lines += _wrapped(f"{design.task}; {design.data}{own}", 8, f"    {letter(number):<2}  ")
     return lines
 
@@ -375,51 +364,35 @@ def _details(report: IdentifiabilityReport) -> list[str]:
 def _table(report: IdentifiabilityReport) -> list[str]:
     """Standard errors of every quantity by the prior, now, and with each design; those of open
     quantities in brackets."""
-    names = told(report.present.quantities)
     possible = [(letter(i), d) for i, d in enumerate(report.designs) if d.failed is None]
-    wide = max(24, *(1 + len(name) for name in names))
-    doubted, added = (
-        DOUBTED * bool(report.open_in_fit),
-        ". A, B, ...: with that measurement added" * bool(possible),
-    )
-    lines = _wrapped(
-        "standard errors in percent of the value. In brackets: not determined, since about a third"
-        f" or more of the error without data is left{doubted}. >>: {FAR} % or more. prior: without"
-        f" data. now: with the data of the fit{added}",
-        4,
-        "  ",
-    )
+    doubted = WORDS["also doubted"] * bool(report.open_in_fit)
+    added = WORDS["added"] * bool(possible)
+    lines = _item(WORDS["errors"].format(doubted=doubted, far=FAR, added=added))
     if report.mean_force is not None:
-        lines += _wrapped(
-            "no mean force in newtons was given: forces, stiffness and damping are stated per"
-            f" newton of mean force (that of the fitted muscle is {report.mean_force:.3g} N)",
-            4,
-            "  ",
-        )
+        lines += _item(WORDS["per newton"].format(force=report.mean_force))
     elif report.masses:
-        known = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
-        opened = OPENED * any(FITTED_TOO in outlook.data for outlook in report.designs)
-        lines += _wrapped(f"taken as known, as in the fit: {known}{opened}", 4, "  ")
+        masses = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
+        opened = WORDS["opened"] * any(FITTED_TOO in outlook.data for outlook in report.designs)
+        lines += _item(WORDS["masses"].format(masses=masses, opened=opened))
+    wide = max(24, *(1 + len(name) for name in report.names))
     # two more stand before them
     across = min(COLUMNS, (WIDTH - wide - 17) // CELL - 2)
     for start in range(0, max(len(possible), 1), across):
         block = possible[start : start + across]
         heads = ["prior", "now", *(label for label, _ in block)]
-        lines.append(
-            f"  {'':<{wide}}{'value':>9} {'unit':<5}" + "".join(f"{head:>6}" for head in heads)
-        )
-        for name in names:
+        rows = [["", "value", "unit", *heads]]
+        for name in report.names:
             now = report.present.quantities[name]
-            here = f"({_cell(now, now.stderr)})" if name in report.open_in_fit else _shown(now)
-            cells = [
-                f"({_cell(now, now.prior_sd)})",
-                here,
-                *(_shown(d.quantities[name]) for _, d in block),
-            ]
             value, unit = _stated(now, None if name == MEAN else report.mean_force)
-            lines.append(
-                f"  {name:<{wide}}{value:>9.3g} {unit:<5}" + "".join(f"{cell:>6}" for cell in cells)
-            )
+            sure = now.determined and name not in report.open_in_fit
+            cells = [_cell(now, now.prior_sd, False), _cell(now, now.stderr, sure)]
+            later = [outlook.quantities[name] for _, outlook in block]
+            cells += [_cell(known, known.stderr, known.determined) for known in later]
+            rows.append([name, f"{value:.3g}", unit, *cells])
+        lines += [
+            f"  {name:<{wide}}{value:>9} {unit:<5}" + "".join(f"{cell:>6}" for cell in cells)
+            for name, value, unit, *cells in rows
+        ]
     return lines
 
 
@@ -431,14 +404,10 @@ def _stated(known: Known, mean_force: float | None) -> tuple[float, str]:
     return value, "" if unit == "1" else unit
 
 
-def _shown(known: Known) -> str:
-    cell = _cell(known, known.stderr)
-    return cell if known.determined else f"({cell})"
-
-
-def _cell(known: Known, error: float) -> str:
+def _cell(known: Known, error: float, determined: bool) -> str:
     share = 100 * error / abs(known.value) if known.value else np.inf
-    return f"{share:.2g}" if share < 99.5 else f"{share:.0f}" if share < FAR else ">>"
+    cell = f"{share:.2g}" if share < 99.5 else f"{share:.0f}" if share < FAR else ">>"
+    return cell if determined else f"({cell})"
 
 
 def _most(report: IdentifiabilityReport, outlooks: Iterable[Outlook]) -> Outlook | None:

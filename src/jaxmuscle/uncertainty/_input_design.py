@@ -24,16 +24,18 @@ from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.response._expected_spectrum import expected_spectrum
 
 from ._design_information import (
+    Square,
+    Theta,
     coordinates_of,
     design_information,
-    opened,
-    seen_here,
+    expansion_at,
+    with_open_masses,
 )
 from ._designed_input import DOUBTFUL, DesignedInput
 from ._designs import moved_insertion, without_noise
-from ._identifiability import LEAST_PRIOR, Here, fitted_problem, missed
+from ._identifiability import LEAST_PRIOR, Here, fitted_problem, misfit_notices
 from ._identifiability_report import BASE, NO_NOISE
-from ._lengthening import Lengthening, information_of_lines, lines_in, require_positive
+from ._lengthening import Largest, Lengthening, Lines, Samples, lines_in, require_positive
 from ._multisine import multisine, speed_of
 
 WIDTH, FEWEST = 0.15, 5  # of a step of the density: relative to its frequency; lines in it at least
@@ -106,14 +108,16 @@ def design_input(  # noqa: PLR0913 (options of a public call)
     rate, seconds that are no whole number of samples; `OperatingPointError` for a task without
     linear response.
     """
-    for name, value, unit in (
-        ("rms", rms, "m"),
-        ("peak", peak, "m"),
-        ("speed", speed, "m/s"),
-        ("acceleration", acceleration, "m/s²"),
-        ("rate", rate, "Hz"),
-    ):
-        require_positive(name, np.float64(1.0) if value is None else value, unit)
+    positive = {
+        "rms": (rms, "m"),
+        "peak": (peak, "m"),
+        "speed": (speed, "m/s"),
+        "acceleration": (acceleration, "m/s²"),
+        "rate": (rate, "Hz"),
+    }
+    for name, (value, unit) in positive.items():
+        if value is not None:
+            require_positive(name, value, unit)
     require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
     durations = [float(one) for one in durations]
     require(
@@ -127,15 +131,7 @@ def design_input(  # noqa: PLR0913 (options of a public call)
         f"error = {error} must be a share between 0 and 1, 0.1 for 10 %",
     )
     check_key(key)
-    require(
-        seconds * rate <= MOST,
-        f"seconds = {seconds} at rate = {rate} Hz are more than {MOST} samples: make it shorter",
-    )
-    frequency, samples = lines_in(band, seconds), round(seconds * rate)
-    require(
-        abs(samples - seconds * rate) < ENOUGH * samples,
-        f"seconds = {seconds}: rate = {rate} Hz makes no whole number of samples of it",
-    )
+    frequency, samples = lines_in(band, seconds), _samples(seconds, rate)
     require(
         2 * frequency[-1] < rate,
         f"band = {band} Hz reaches beyond half of rate = {rate} Hz: raise the rate",
@@ -145,7 +141,7 @@ def design_input(  # noqa: PLR0913 (options of a public call)
     crest = np.array(CREST)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_of(key))).tolist())
 
-    def realised(power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def realise(power: Lines) -> tuple[Samples, Largest]:
         """A motion of these lines, made smaller where it must be, and the crest factors of it and
         its derivatives."""
         motion = multisine(frequency * seconds, power, seconds, samples, limits, rng)
@@ -157,65 +153,66 @@ def design_input(  # noqa: PLR0913 (options of a public call)
     with jax.enable_x64(True):
         even = Lengthening.flat(rms, band, seconds)
         experiment = Experiment.of(result, quantities, even, target)
-        motion = realised(even.power)[0]
+        motion = realise(even.power)[0]
         even = even.of_motion(motion)
+        # What limits a motion are its peaks, which follow from its density: both in turn.
         for _ in range(TRIES if np.isfinite(min(limits)) else 1):
             allowed = np.minimum(limits / crest, [rms, np.inf, np.inf])
-            motion, crest = realised(experiment.best(allowed, spread))
-        wide = (
-            Lengthening.flat(rms, (band[0], 2 * band[1]), seconds) if 4 * band[1] < rate else None
-        )
-        wider = (
-            None
-            if wide is None
-            else (2.0 * band[1], experiment.errors_of(wide.within(limits / crest)))
-        )
-    own, quantities = even.of_motion(motion), experiment.quantity
-    known = experiment.here.values
-    values, units = (
-        {n: value for n, (value, _) in known.items()},
-        {n: unit for n, (_, unit) in known.items()},
-    )
-    now, flat, best = (experiment.errors(p) for p in (None, even.power, own.power))
-    longer = {one: experiment.errors(own.power, one / seconds) for one in durations}
-    needed = (
-        None if error is None else (float(error), seconds * experiment.times_for(own.power, error))
-    )
-    vague = [n for n in quantities if now[n] > DOUBTFUL * abs(values[n])]
-    with jax.enable_x64(True):
+            motion, crest = realise(experiment.best(allowed, spread))
+        own, wider = even.of_motion(motion), None
+        if 4 * band[1] < rate:
+            wide = Lengthening.flat(rms, (band[0], 2 * band[1]), seconds).within(limits / crest)
+            wider = 2.0 * band[1], experiment.errors(wide.power, lines=experiment.by_line(wide))
+        now, known = experiment.errors(None), experiment.here.values
         others = {
             n: tuple(
                 _elsewhere(result, n, even, target, own.power, side * experiment.towards(n))
                 for side in (-1, 1)
             )
-            for n in vague
+            for n in experiment.quantity
+            if now[n] > DOUBTFUL * abs(known[n][0])
         }
-    notices = missed(result) if isinstance(result, FitResult) else ()
     return DesignedInput(
-        quantities,
+        experiment.quantity,
         own,
         even,
         motion,
         float(rate),
-        values,
-        units,
-        now,
-        flat,
-        best,
-        longer,
-        needed,
-        notices,
-        others,
-        experiment.masses,
-        experiment.held,
-        experiment.by_prior(),
-        wider,
-        experiment.moved,
-        (rms, *limits.tolist()),
+        values={n: value for n, (value, _) in known.items()},
+        units={n: unit for n, (_, unit) in known.items()},
+        prior=experiment.by_prior(),
+        now=now,
+        flat=experiment.errors(even.power),
+        stderr=experiment.errors(own.power),
+        by_seconds={one: experiment.errors(own.power, one / seconds) for one in durations},
+        needed=None
+        if error is None
+        else (float(error), seconds * experiment.times_for(own.power, error)),
+        notices=misfit_notices(result) if isinstance(result, FitResult) else (),
+        elsewhere=others,
+        masses=experiment.masses,
+        held=experiment.held,
+        wider=wider,
+        moved=experiment.moved,
+        allowed=(rms, *limits.tolist()),
     )
 
 
-def _named(name: str, known: Mapping[str, Any], targets: Iterable[str | None]) -> str:
+def _samples(seconds: float, rate: float) -> int:
+    """Of one period."""
+    require(
+        seconds * rate <= MOST,
+        f"seconds = {seconds} at rate = {rate} Hz are more than {MOST} samples: make it shorter",
+    )
+    samples = round(seconds * rate)
+    require(
+        abs(samples - seconds * rate) < ENOUGH * samples,
+        f"seconds = {seconds}: rate = {rate} Hz makes no whole number of samples of it",
+    )
+    return samples
+
+
+def _full_name(name: str, known: Mapping[str, Any], targets: Iterable[str | None]) -> str:
     """A quantity by the name that it has in a fit of several targets, of the first that has it:
     "K_w_tangent@moved"."""
     return next(
@@ -228,8 +225,8 @@ def _elsewhere(
     name: str,
     record: Lengthening,
     target: str | None,
-    power: np.ndarray,
-    step: np.ndarray,
+    power: Lines,
+    step: Theta,
 ) -> tuple[float, float]:
     """A quantity's value a step away from the fit, and the standard error there with a motion; nan
     where no muscle is."""
@@ -248,11 +245,11 @@ class Experiment(NamedTuple):
     quantity: tuple[str, ...]
     masses: dict[str, float]
     held: tuple[str, ...]
-    prior: Float[np.ndarray, " free"]
-    start: Float[np.ndarray, "free free"]
-    apart: Float[np.ndarray, "free free"]
-    frequency: Float[np.ndarray, " lines"]
-    informed: Callable[[Lengthening], Float[np.ndarray, "lines free free"]]
+    prior: Theta
+    start: Square
+    apart: Square
+    frequency: Lines
+    by_line: Callable[[Lengthening], Float[np.ndarray, "lines free free"]]
     lines: Float[np.ndarray, "lines free free"]
     moved: bool
 
@@ -263,79 +260,59 @@ class Experiment(NamedTuple):
         quantity: Iterable[str],
         record: Lengthening,
         target: str | None,
-        step: Float[np.ndarray, " free"] | None = None,
+        step: Theta | None = None,
     ) -> "Experiment":
         """Of a record, at the values of a fit or task, or a step of its θ away from them. Needs
         double precision."""
         fitted, theta, derived = _problem(given)
         if without_noise(fitted):
             raise ValueError(f"result: {NO_NOISE}")
-        fitted = dataclasses.replace(fitted, parts=tuple(_as_moved(part) for part in fitted.parts))
-        problem = opened(fitted)
+        fitted = dataclasses.replace(fitted, parts=tuple(map(_held_by_motor, fitted.parts)))
+        problem = with_open_masses(fitted)
         theta = np.append(theta, np.zeros(len(problem.prior) - len(theta)))
         if step is not None:
             theta = theta + step
             parts = (dataclasses.replace(part, task=part.task_at(theta)) for part in problem.parts)
             problem = dataclasses.replace(problem, parts=tuple(parts))
-        told = problem.by_name(
+        tangents = problem.by_name(
             [dict.fromkeys(TANGENTS if has_tangents(part.task) else ()) for part in problem.parts]
         )
-        here = Here.of(problem, seen_here(problem, theta), dict.fromkeys([*derived, *told]))
+        here = Here.of(problem, expansion_at(problem, theta), dict.fromkeys([*derived, *tangents]))
         moved = [part.name for part in fitted.parts if part.target.stiffness is not None]
         targets = [target, *moved, *(part.name for part in fitted.parts)]
-        quantity = tuple(_named(name, here.gradients, targets) for name in quantity)
+        quantity = tuple(_full_name(name, here.gradients, targets) for name in quantity)
         for name in quantity:
             if name not in here.gradients:
-                base = name.partition("@")[0]
-                if base in TANGENTS:
-                    raise ValueError(
-                        f"quantity {name!r}: fits of a held or a moved insertion have it"
-                        " (Isometric, PrescribedLength, with the paper's muscle)"
-                    )
-                fixed = base in (*problem.parts[0].task.parameter_names, *BASE.values())
-                raise ValueError(
-                    f"quantity {name!r} "
-                    + (
-                        "is fixed: leave its parameter free"
-                        if fixed
-                        else f"is unknown: {choices(name, here.gradients)}"
-                    )
-                )
+                raise ValueError(f"quantity {name!r}{_unknown(name, problem, here)}")
         design = moved_insertion(
             record, problem.parts[0].target.settings, coefficient_of_variation=True, target=target
         )
         like = design.like(problem)
-        task: Any = _moved(like.task).with_parts(settings=like.target.settings)
+        task: Any = _with_motor(like.task).with_parts(settings=like.target.settings)
         # a response tells how the muscle is damped, so the ratio needs no prior of its own
         prior = problem.prior
         start = np.diag(prior) + (here.information if isinstance(given, FitResult) else 0.0)
-        apart = start + design_information(
-            problem, theta, dataclasses.replace(design, task=task, lengthening=None)
-        )
+        still = dataclasses.replace(design, task=task, lengthening=None)
         own, coordinates = coordinates_of(like, theta, task)
 
-        def informed(record: Lengthening) -> np.ndarray:
+        def by_line(record: Lengthening) -> np.ndarray:
             lines = np.zeros((len(record.frequency), *start.shape))
-            found = information_of_lines(
-                task, coordinates, theta[own], record.frequency, record.seconds
-            )
-            lines[:, own[:, None], own] = found
+            lines[:, own[:, None], own] = record.by_line(task, coordinates, theta[own])
             return lines
 
-        unfitted = [name for name in MASSES if name not in design.like(fitted).coordinates.names]
-        masses = {name: float(task[name]) for name in unfitted if name in task.parameter_names}
-        held = tuple(name for name in masses if name not in coordinates.names)
+        fixed = set(MASSES) - set(design.like(fitted).coordinates.names)
+        masses = {n: float(task[n]) for n in MASSES if n in fixed and n in task.parameter_names}
         return cls(
             here,
             quantity,
             masses,
-            held,
+            tuple(name for name in masses if name not in coordinates.names),
             prior,
             start,
-            apart,
+            start + design_information(problem, theta, still),
             record.frequency,
-            informed,
-            informed(record),
+            by_line,
+            by_line(record),
             bool(moved),
         )
 
@@ -345,7 +322,7 @@ class Experiment(NamedTuple):
         rows = [self.here.gradients[n] / (self.here.values[n][0] or 1.0) for n in self.quantity]
         return np.stack(rows)
 
-    def best(self, allowed: Float[np.ndarray, "3"], spread: float) -> Float[np.ndarray, " lines"]:
+    def best(self, allowed: Largest, spread: float) -> Lines:
         """Mean square of every line [m²] such that the quantities become best known.
 
         `allowed`: largest rms of displacement [m], speed [m/s] and acceleration [m/s²]; that of the
@@ -360,12 +337,12 @@ class Experiment(NamedTuple):
         ]
 
         def height(share: np.ndarray) -> tuple[float, np.ndarray]:
+            """Logarithm of the sum of the variances, and its slopes: what is stiff or soft differs
+            by its factor alone, so that one tolerance of the search serves all."""
             reached = np.linalg.solve(self.apart + np.tensordot(share, each, 1), self.rows.T)
-            sum_of_variances = np.sum(self.rows.T * reached)
-            return (
-                np.log(sum_of_variances),
-                -np.einsum("iq,kij,jq->k", reached, each, reached) / sum_of_variances,
-            )
+            variances = np.sum(self.rows.T * reached)
+            slopes = np.einsum("iq,kij,jq->k", reached, each, reached)
+            return np.log(variances), -slopes / variances
 
         within = [scipy.optimize.LinearConstraint(row, -np.inf, 1.0) for row in used]
         begin = np.full(len(steps), 1 / len(steps)) / max(map(np.mean, used))
@@ -386,33 +363,24 @@ class Experiment(NamedTuple):
         return rms**2 * np.maximum(found.x, 0) @ steps
 
     def errors(
-        self, power: Float[np.ndarray, " lines"] | None, times: float = 1.0
+        self, power: Lines | None, times: float = 1.0, lines: np.ndarray | None = None
     ) -> dict[str, float]:
         """Standard errors of all quantities with a motion, if the record is so many `times` as
-        long; without it if None."""
-        return self._errors(None if power is None else np.tensordot(power, self.lines, 1), times)
-
-    def errors_of(self, record: Lengthening) -> dict[str, float]:
-        """Standard errors of all quantities with a motion of other lines. Needs double
-        precision."""
-        return self._errors(np.tensordot(record.power, self.informed(record), 1))
-
-    def _errors(
-        self, motion: Float[np.ndarray, "free free"] | None, times: float = 1.0
-    ) -> dict[str, float]:
-        record = 0.0 if motion is None else self.apart - self.start + motion
-        known = self.start + times * record
-        after = np.linalg.pinv(known, hermitian=True)
+        long; without it if None. `lines`, of other frequencies than the record's."""
+        record: Any = 0.0
+        if power is not None:
+            motion = np.tensordot(power, self.lines if lines is None else lines, 1)
+            record = self.apart - self.start + motion
+        after = np.linalg.pinv(self.start + times * record, hermitian=True)
         return {name: float(np.sqrt(g @ after @ g)) for name, g in self.here.gradients.items()}
 
     def by_prior(self) -> dict[str, float]:
         """Standard errors of all quantities without any data."""
         before = 1 / np.maximum(self.prior, LEAST_PRIOR)
-        return {
-            name: float(np.sqrt(np.sum(before * g**2))) for name, g in self.here.gradients.items()
-        }
+        gradients = self.here.gradients.items()
+        return {name: float(np.sqrt(np.sum(before * g**2))) for name, g in gradients}
 
-    def towards(self, name: str) -> Float[np.ndarray, " free"]:
+    def towards(self, name: str) -> Theta:
         """The step `Σ g / √(gᵀ Σ g)` of the fit's θ to the likeliest muscle in which a quantity is
         a standard error larger.
 
@@ -422,74 +390,75 @@ class Experiment(NamedTuple):
         far = np.linalg.pinv(self.start, hermitian=True) @ g
         return far / np.sqrt(g @ far)
 
-    def times_for(self, power: Float[np.ndarray, " lines"], error: float) -> float:
+    def times_for(self, power: Lines, error: float) -> float:
         """How many times as long a record must be for a relative error of every quantity; infinite
         where none is."""
+        values = {n: abs(self.here.values[n][0] or 1.0) for n in self.quantity}
 
         def above(log_times: float) -> float:
             found = self.errors(power, np.exp(log_times))
-            return float(
-                np.log(
-                    max(found[n] / abs(self.here.values[n][0] or 1.0) for n in self.quantity)
-                    / error
-                )
-            )
+            return float(np.log(max(found[n] / value for n, value in values.items()) / error))
 
         shortest, longest = np.log(1 / LONGEST), np.log(LONGEST)
         if above(longest) > 0:
             return np.inf
+        if above(shortest) <= 0:
+            return 0.0
+        return float(np.exp(scipy.optimize.brentq(above, shortest, longest)))
+
+
+def _unknown(name: str, problem: FitProblem, here: Here) -> str:
+    """Why no motion can be designed for a quantity."""
+    base = name.partition("@")[0]
+    if base in TANGENTS:
         return (
-            0.0
-            if above(shortest) <= 0
-            else float(np.exp(scipy.optimize.brentq(above, shortest, longest)))
+            ": fits of a held or a moved insertion have it (Isometric, PrescribedLength, with the"
+            " paper's muscle)"
         )
+    if base in (*problem.parts[0].task.parameter_names, *BASE.values()):
+        return " is fixed: leave its parameter free"
+    return f" is unknown: {choices(name, here.gradients)}"
 
 
-def steps_of(frequency: Float[np.ndarray, " lines"]) -> Float[np.ndarray, "steps lines"]:
+def steps_of(frequency: Lines) -> Float[np.ndarray, "steps lines"]:
     """Where the density may be raised: neighbouring lines, each with an equal share."""
     starts, n = [0], len(frequency)
-    while (
-        following := max(
-            starts[-1] + FEWEST,
-            int(np.searchsorted(frequency, (1 + WIDTH) * frequency[starts[-1]])),
-        )
-    ) < n:
+    while True:
+        wide = np.searchsorted(frequency, (1 + WIDTH) * frequency[starts[-1]])
+        following = max(starts[-1] + FEWEST, int(wide))
+        if following >= n:
+            break
         starts.append(following)
     if n - starts[-1] < FEWEST and len(starts) > 1:
         starts.pop()
-    ends = [*starts[1:], n]
-    inside = [(np.arange(n) >= a) & (np.arange(n) < b) for a, b in zip(starts, ends, strict=True)]
-    return np.stack([one / np.sum(one) for one in inside])
+    counts = np.diff([*starts, n])
+    step = np.repeat(np.arange(len(starts)), counts)
+    return (step == np.arange(len(starts))[:, None]) / counts[:, None]
 
 
-def _as_moved(part: Part) -> Part:
+def _held_by_motor(part: Part) -> Part:
     """A part whose insertion is held as one in which a motor holds it: its stiffness as stretched
     there can be asked for."""
-    return (
-        dataclasses.replace(part, task=_moved(part.task))
-        if isinstance(part.task, Isometric)
-        else part
-    )
+    held = isinstance(part.task, Isometric)
+    return dataclasses.replace(part, task=_with_motor(part.task)) if held else part
 
 
-def _moved(task: Any) -> AbstractTask:
+def _with_motor(task: Any) -> AbstractTask:
     """The experiment with the muscle of a task, at the same P_w and x_z."""
     if type(task) is PrescribedLength:
         return task
-    return task.as_task(
-        PrescribedLength,
-        **{name: getattr(task, name) for name in ("P_w", "x_z") if hasattr(task, name)},
-    )
+    inputs = {name: getattr(task, name) for name in ("P_w", "x_z") if hasattr(task, name)}
+    return task.as_task(PrescribedLength, **inputs)
 
 
 def _problem(
     given: FitResult | AbstractTask,
-) -> tuple[FitProblem, Float[np.ndarray, " free"], Iterable[str]]:
+) -> tuple[FitProblem, Theta, Iterable[str]]:
     """A fit's problem, or that of a task with the data that it would give; θ, and what can be
     derived."""
     if isinstance(given, FitResult):
         return *fitted_problem(given, None), given.derived_names
-    task = as_numbers(_moved(given))
+    task = as_numbers(_with_motor(given))
     power = np.asarray(expected_spectrum(task).proportional)
     target = Target(type(task).__name__, power, segments=1, settings=task.settings)
     problem = planned(task, target, FitOptions(coefficient_of_variation=False)).problem

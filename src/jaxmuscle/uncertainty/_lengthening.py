@@ -17,6 +17,13 @@ from jaxmuscle.response._linearised import linearise
 
 EVEN = 1024  # lines are padded to multiples of it: few programs for any record
 WHOLE = 1e-9
+WORDS = "lengthening of {:.3g} mm rms, {:.2g} to {:.2g} Hz, for {:g} s"
+
+
+Lines = Float[np.ndarray, " lines"]
+Samples = Float[np.ndarray, " samples"]
+# of displacement, speed and acceleration
+Largest = Float[np.ndarray, "3"]
 
 
 def require_positive(name: str, value: float, unit: str) -> None:
@@ -25,7 +32,7 @@ def require_positive(name: str, value: float, unit: str) -> None:
         raise ValueError(f"{name} = {value} {unit} must be a positive number")
 
 
-def lines_in(band: tuple[float, float], seconds: float) -> Float[np.ndarray, " lines"]:
+def lines_in(band: tuple[float, float], seconds: float) -> Lines:
     """Multiples of 1 / seconds [Hz] in a band, both ends included. Raises `ValueError` if there is
     none."""
     require_positive("seconds", seconds, "s")
@@ -53,8 +60,8 @@ class Lengthening(Printed, Result, eqx.Module):
       lines
     """
 
-    frequency: Float[np.ndarray, " lines"]
-    power: Float[np.ndarray, " lines"]
+    frequency: Lines
+    power: Lines
     seconds: float = eqx.field(static=True)
 
     @classmethod
@@ -65,18 +72,17 @@ class Lengthening(Printed, Result, eqx.Module):
         lines = lines_in(band, seconds)
         return cls(lines, np.full(len(lines), rms**2 / len(lines)), seconds)
 
-    def within(self, most: Float[np.ndarray, "3"]) -> "Lengthening":
+    def within(self, most: Largest) -> "Lengthening":
         """Made smaller, so that displacement [m], speed [m/s] and acceleration [m/s²] are at most
         so large (rms)."""
-        reached = [
-            np.sqrt(np.sum(self.power * (2 * np.pi * self.frequency) ** (2 * order)))
-            for order in range(3)
-        ]
-        return Lengthening(
-            self.frequency, self.power * min(1.0, *(most / reached)) ** 2, self.seconds
-        )
+        share = min(1.0, *(most / [self.rms_of(order) for order in range(3)]))
+        return Lengthening(self.frequency, self.power * share**2, self.seconds)
 
-    def of_motion(self, displacement: Float[np.ndarray, " samples"]) -> "Lengthening":
+    def rms_of(self, order: int) -> float:
+        """Root of the mean square of the displacement's derivative of that order."""
+        return float(np.sqrt(np.sum((2 * np.pi * self.frequency) ** (2 * order) * self.power)))
+
+    def of_motion(self, displacement: Samples) -> "Lengthening":
         """One of the same frequencies, with the power of `displacement` [m], one period of a
         motion, at each of them."""
         places = np.rint(self.frequency * self.seconds).astype(int)
@@ -86,19 +92,11 @@ class Lengthening(Printed, Result, eqx.Module):
     @property
     def rms(self) -> float:
         """Root of the mean square [m]."""
-        return float(np.sqrt(np.sum(self.power)))
-
-    @property
-    def rms_speed(self) -> float:
-        """The same of its velocity [m/s]."""
-        return float(np.sqrt(np.sum((2 * np.pi * self.frequency) ** 2 * self.power)))
+        return self.rms_of(0)
 
     def __str__(self) -> str:
         moved = self.frequency[self.power > 0]
-        return (
-            f"lengthening of {1e3 * self.rms:.3g} mm rms, {moved[0]:.2g} to {moved[-1]:.2g} Hz, for"
-            f" {self.seconds:g} s"
-        )
+        return WORDS.format(1e3 * self.rms, moved[0], moved[-1], self.seconds)
 
     def information(
         self, task: PrescribedLength, coordinates: Coordinates, theta: Float[np.ndarray, " own"]
@@ -107,35 +105,27 @@ class Lengthening(Printed, Result, eqx.Module):
 
         For the package itself: `coordinates` and `theta` are those of the problem of a fit.
         """
-        return np.tensordot(
-            self.power,
-            information_of_lines(task, coordinates, theta, self.frequency, self.seconds),
-            1,
+        return np.tensordot(self.power, self.by_line(task, coordinates, theta), 1)
+
+    def by_line(
+        self, task: PrescribedLength, coordinates: Coordinates, theta: Float[np.ndarray, " own"]
+    ) -> Float[np.ndarray, "lines own own"]:
+        """For the package itself: the information of θ per mean square [1/m²] of each line, where
+        the task is that at θ.
+
+            A_k = 2 T Re(∂H_k* ∂H_kᵀ) / S(f_k)
+
+        H is the `dynamic_stiffness`, S the one-sided `noise_density` of the force. For a line `a
+        cos(2π f t)`, of mean square p = a²/2, changes the ordinate of the force by ∂H a/2, while
+        real and imaginary part of the noise there have the variance S / (4T) each.
+        """
+        f = self.frequency
+        padded = np.resize(f, -(-len(f) // EVEN) * EVEN)
+        slopes, density = jax.tree.map(
+            np.asarray, _sensed(as_arrays(task), as_arrays(coordinates), theta, padded)
         )
-
-
-def information_of_lines(
-    task: PrescribedLength,
-    coordinates: Coordinates,
-    theta: Float[np.ndarray, " own"],
-    frequency: Float[np.ndarray, " lines"],
-    seconds: float,
-) -> Float[np.ndarray, "lines own own"]:
-    """Fisher information of θ per mean square [1/m²] of each line of the lengthening, where the
-    task is that at θ.
-
-        A_k = 2 T Re(∂H_k* ∂H_kᵀ) / S(f_k)
-
-    H is the `dynamic_stiffness`, S the one-sided `noise_density` of the force. For a line `a cos(2π
-    f t)`, of mean square p = a²/2, changes the ordinate of the force by ∂H a/2, while real and
-    imaginary part of the noise there have the variance S / (4T) each.
-    """
-    padded = np.resize(frequency, -(-len(frequency) // EVEN) * EVEN)
-    slopes, density = jax.tree.map(
-        np.asarray, _sensed(as_arrays(task), as_arrays(coordinates), theta, padded)
-    )
-    slopes, density = slopes[:, : len(frequency)], density[: len(frequency)]
-    return 2 * seconds * np.einsum("pki,pkj->kij", slopes, slopes) / density[:, None, None]
+        slopes, density = slopes[:, : len(f)], density[: len(f), None, None]
+        return 2 * self.seconds * np.einsum("pki,pkj->kij", slopes, slopes) / density
 
 
 @kept

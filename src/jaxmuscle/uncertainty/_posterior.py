@@ -23,7 +23,7 @@ from jaxmuscle.objective._problem import FitProblem
 
 from ._chains import Chains, sample
 from ._frequency_grid import edges_of
-from ._posterior_checks import diagnosed, diverges, modes_of, replicates, verdict
+from ._posterior_checks import diagnose, diverges, modes_of, replicates, verdict
 from ._posterior_density import PosteriorDensity, density_about
 from ._posterior_result import Posterior, PosteriorPart
 
@@ -99,7 +99,7 @@ def posterior(  # noqa: PLR0913 (options of a public call)
             problem, likelihood, problem.theta_of(tuple(result.tasks.values()))
         )
         attempts = (
-            _reported(problem, whitened, found, result, key, warmup, limits)
+            _report(problem, whitened, found, result, key, warmup, limits)
             for found, whitened in sample(
                 density, fold_in(problem.key, 5), chains, lengths, warmup, tell
             )
@@ -113,7 +113,7 @@ def posterior(  # noqa: PLR0913 (options of a public call)
         return drawn
 
 
-def _reported(
+def _report(
     problem: FitProblem,
     density: PosteriorDensity,
     found: Chains,
@@ -134,7 +134,7 @@ def _reported(
     places = {name: problem.where(name) for name in result.derived_names if name not in samples}
     known = {name: derived[i][base].reshape(shape) for name, (i, base) in places.items()}
     determined = tuple(name for name in (*samples, *known) if name in result.determined)
-    diagnostics = {name: diagnosed(x) for name, x in (samples | known).items()}
+    diagnostics = {name: diagnose(x) for name, x in (samples | known).items()}
     success, message = verdict(found, diagnostics, determined)
     settings = settings_of(problem, limits) | {
         "chains": shape[0],
@@ -179,7 +179,7 @@ def _thetas(
     its cell; s and offsets."""
     coordinates, names = problem.coordinates, problem.coordinates.names
     both = found.s.reshape(-1, found.s.shape[-1])
-    parts = [np.asarray(_placed(density, part)) for part in _filled(both)]
+    parts = [np.asarray(_placed(density, part)) for part in _in_batches(both)]
     s = np.concatenate(parts)[: len(both)]
     theta = np.asarray(coordinates.theta(s))
     if density.bands:
@@ -208,7 +208,7 @@ def _cells(key: Array, heights: Array | np.ndarray) -> tuple[Array, Array]:
 
 @kept
 def _placed(density: PosteriorDensity, both: Array | np.ndarray) -> Array:
-    return jax.lax.map(lambda row: density.placed(row)[0], both, batch_size=16)
+    return jax.lax.map(lambda row: density.place(row)[0], both, batch_size=16)
 
 
 @kept
@@ -217,11 +217,11 @@ def _frequencies(density: PosteriorDensity, white: Array | np.ndarray) -> tuple[
 
 
 def _heights(density: PosteriorDensity, white: np.ndarray) -> tuple[np.ndarray, ...]:
-    parts = [_frequencies(density, part) for part in _filled(white)]
+    parts = [_frequencies(density, part) for part in _in_batches(white)]
     return tuple(np.concatenate(x)[: len(white)] for x in zip(*parts, strict=True))
 
 
-def _filled(rows: np.ndarray) -> list[np.ndarray]:
+def _in_batches(rows: np.ndarray) -> list[np.ndarray]:
     """Parts of `ROWS` rows, the last filled up, so that one program serves them all."""
     fill = np.broadcast_to(rows[-1], (-len(rows) % ROWS, *rows.shape[1:]))
     whole = np.concatenate([rows, fill])

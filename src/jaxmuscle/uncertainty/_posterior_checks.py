@@ -67,7 +67,7 @@ LEAST_MODE = 0.05
 TAILS = (0.05, 0.95)
 
 
-def diagnosed(draws: np.ndarray) -> tuple[float, float, float]:
+def diagnose(draws: np.ndarray) -> tuple[float, float, float]:
     from arviz_stats.base.array import array_stats
 
     if np.ptp(draws) <= 1e-12 * np.abs(draws).max():

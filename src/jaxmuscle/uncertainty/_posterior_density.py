@@ -3,7 +3,7 @@ grid."""
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,7 +30,20 @@ from jaxmuscle.response._linear_task import Linearisation
 from jaxmuscle.response._linearised import linearise
 from jaxmuscle.response._transfer import harmonic_system, polynomial, polynomials
 
-from ._frequency_grid import Band, band_about
+from ._frequency_grid import Band, Grid, Numbers, band_about
+
+Free = Float[Array, " free"]
+Offsets = Float[Array, " parts"]
+Sampled = Float[Array, " sampled"]
+Heights = Float[Array, " grid"]
+Number = Float[Numbers, ""]
+Systems = dict[int, Linearisation]
+
+
+def _reply(size: Any, numerator: Array, denominator: Array, frequency: Array) -> Array:
+    """The line of a harmonic of complex `size` at each frequency."""
+    s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
+    return size * polynomial(numerator, s) / polynomial(denominator, s)
 
 
 class Features(NamedTuple):
@@ -49,24 +62,18 @@ class Features(NamedTuple):
     denominator: Float[Array, " below"]
     stiffness: Float[Array, "2 points"] | tuple[()]
 
-    def moments(self, frequency: Float[Array, " grid"], table: LineTable) -> Moments:
+    def moments(self, frequency: Heights, table: LineTable) -> Moments:
         """Moments with the harmonic at each frequency, the last axis of the powers and the only one
         of the variance.
 
         Powers are in units of the noise's, in the precision of the table. They end with the last
         frequency whose line shows in the bins, and with no line at all.
         """
-        s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
-        reply = (
-            jax.lax.complex(*self.size)
-            * polynomial(self.numerator, s)
-            / polynomial(self.denominator, s)
-        )
+        size = jax.lax.complex(*self.size)
+        reply = _reply(size, self.numerator, self.denominator, frequency)
         scale = jax.lax.stop_gradient(jnp.sum(self.power))
-        line = table.power(
-            reply[: table.level.shape[-1]] * jax.lax.rsqrt(scale).astype(reply.dtype)
-        )
-        line = jnp.pad(line, ((0, 0), (0, 1)))
+        shown = reply[: table.level.shape[-1]] * jax.lax.rsqrt(scale).astype(reply.dtype)
+        line = jnp.pad(table.power(shown), ((0, 0), (0, 1)))
         power = (self.power / scale).astype(line.dtype)
         return Moments(
             power[:, None] + line,
@@ -92,16 +99,13 @@ class Level(eqx.Module):
     harmonic frequencies.
     """
 
-    start: Float[Array | np.ndarray, ""]
-    sd: Float[Array | np.ndarray, ""]
-    log_variation: Float[Array | np.ndarray, ""]
-    along: Float[Array | np.ndarray, " free"]
-    weight: Float[Array | np.ndarray, " grid"]
+    start: Number
+    sd: Number
+    log_variation: Number
+    along: Float[Numbers, " free"]
+    weight: Grid
     column: int = eqx.field(static=True)
     part: int = eqx.field(static=True)
-
-
-Systems = dict[int, Linearisation]
 
 
 class PosteriorDensity(eqx.Module):
@@ -119,9 +123,9 @@ class PosteriorDensity(eqx.Module):
 
     likelihood: Likelihood
     bands: tuple[Band, ...]
-    point: Float[Array | np.ndarray, " free"]
-    centre: Float[Array | np.ndarray, " sampled"]
-    scale: Float[Array | np.ndarray, "sampled sampled"]
+    point: Float[Numbers, " free"]
+    centre: Float[Numbers, " sampled"]
+    scale: Float[Numbers, "sampled sampled"]
     levels: tuple[Level, ...]
     columns: tuple[int, ...] = eqx.field(static=True)
     offsets: tuple[int, ...] = eqx.field(static=True)
@@ -131,24 +135,20 @@ class PosteriorDensity(eqx.Module):
         """How many numbers are sampled."""
         return len(self.columns) + len(self.offsets)
 
-    def split(
-        self, white: Float[Array, " sampled"]
-    ) -> tuple[Float[Array, " free"], Float[Array, " parts"]]:
+    def split(self, white: Sampled) -> tuple[Free, Offsets]:
         """Unbounded coordinates (with the point's own where not sampled) and the offsets of
         whitened ones."""
-        return self.placed(self.centre + self.scale @ white)[:2]
+        return self.place(self.centre + self.scale @ white)[:2]
 
-    def placed(
-        self, both: Float[Array | np.ndarray, " sampled"]
-    ) -> tuple[Float[Array, " free"], Float[Array, " parts"], Systems]:
+    def place(self, both: Float[Numbers, " sampled"]) -> tuple[Free, Offsets, Systems]:
         """The same of sampled coordinates, with the linearised tasks as far as they were needed."""
         s = jnp.asarray(self.point).at[jnp.asarray(self.columns)].set(both[: len(self.columns)])
         offsets = jnp.zeros(len(self.likelihood.bins))
         offsets = offsets.at[jnp.asarray(self.offsets, dtype=int)].set(both[len(self.columns) :])
-        s, systems = self.levelled(s)
+        s, systems = self.from_levels(s)
         return s, offsets, systems
 
-    def levelled(self, s: Float[Array, " free"]) -> tuple[Float[Array, " free"], Systems]:
+    def from_levels(self, s: Free) -> tuple[Free, Systems]:
         """Coordinates s of which some are counted from a level, as they are."""
         systems: Systems = {}
         for level in self.levels:
@@ -164,7 +164,7 @@ class PosteriorDensity(eqx.Module):
         """The band that acts on a part."""
         return next((band for band in self.bands if part in band.parts), None)
 
-    def task(self, s: Float[Array, " free"], part: int) -> AbstractTask:
+    def task(self, s: Free, part: int) -> AbstractTask:
         """One part's task at s."""
         objective = self.likelihood.objective
         own = objective.parts[part]
@@ -172,26 +172,20 @@ class PosteriorDensity(eqx.Module):
             own.task, own.coordinates, objective.own(objective.coordinates.theta(s), part)
         )
 
-    def log_variation(
-        self, s: Float[Array, " free"], part: int, weight: Float[Array | np.ndarray, " grid"]
-    ) -> tuple[Scalar, Linearisation]:
+    def log_variation(self, s: Free, part: int, weight: Grid) -> tuple[Scalar, Linearisation]:
         """Log coefficient of variation of a long recording, the harmonic's frequencies weighted;
         the linearised task."""
         task, band = self.task(s, part), self.band_of(part)
         system = linearise(task)
-        variance, (top, below) = (
-            noise_variance(task, system),
-            polynomials(harmonic_system(task, system)),
-        )
-        frequency = jnp.atleast_1d(
-            task.harmonic.frequency if band is None else jnp.asarray(band.frequency)
-        )
-        s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
-        reply = harmonic_size(task, system.A.dtype) * polynomial(top, s) / polynomial(below, s)
+        frequency = task.harmonic.frequency if band is None else band.frequency
+        size = harmonic_size(task, system.A.dtype)
+        top, below = polynomials(harmonic_system(task, system))
+        reply = _reply(size, top, below, jnp.atleast_1d(jnp.asarray(frequency)))
         line = 0.5 * jnp.sum(weight * (jnp.real(reply) ** 2 + jnp.imag(reply) ** 2))
-        return 0.5 * jnp.log(variance + line) - jnp.log(jnp.abs(system.rest)), system
+        variance = noise_variance(task, system) + line
+        return 0.5 * jnp.log(variance) - jnp.log(jnp.abs(system.rest)), system
 
-    def features(self, s: Float[Array, " free"], part: int, systems: Systems) -> Features:
+    def features(self, s: Free, part: int, systems: Systems) -> Features:
         """Of a part's model at s (linearised already, perhaps)."""
         task, model = self.task(s, part), self.likelihood.objective.parts[part].model
         assert isinstance(model, Linear)
@@ -201,22 +195,10 @@ class PosteriorDensity(eqx.Module):
         size = jnp.stack([jnp.real(size), jnp.imag(size)])
         power = jnp.sum(power, axis=0)[model.chosen] * model.correction.power
         stiffness = () if model.points is None else parts_of_stiffness(task, system, model.points)
-        return Features(
-            power,
-            system.rest,
-            variance,
-            size,
-            *polynomials(harmonic_system(task, system)),
-            stiffness,
-        )
+        line = polynomials(harmonic_system(task, system))
+        return Features(power, system.rest, variance, size, *line, stiffness)
 
-    def heights(
-        self,
-        band: Band,
-        s: Float[Array, " free"],
-        offsets: Float[Array, " parts"],
-        systems: Systems,
-    ) -> Float[Array, " grid"]:
+    def heights(self, band: Band, s: Free, offsets: Offsets, systems: Systems) -> Heights:
         """Log likelihood of a band's targets at every frequency, with the weights of the grid."""
         found = jnp.asarray(band.log_weight)
         for part, table in zip(band.parts, band.tables, strict=True):
@@ -226,18 +208,15 @@ class PosteriorDensity(eqx.Module):
             spread = moments._replace(power=moments.power[:, which], line=moments.line[:, which])
             if bins is None:
                 own = partial(self.likelihood.of_part, part, offset=offsets[part], bins=None)
-                found += jax.vmap(lambda m, own=own: own(m), in_axes=(GRID,))(spread)
             else:
+                own = partial(self.likelihood.further, part)
                 law, offset = as_arrays((bins, offsets[part]), moments.power.dtype)
-                found += log_density(law, moments.power, moments.line, offset)[which].astype(
-                    found.dtype
-                )
-                found += jax.vmap(lambda m, i=part: self.likelihood.further(i, m), in_axes=(GRID,))(
-                    spread
-                )
+                height = log_density(law, moments.power, moments.line, offset)
+                found += height[which].astype(found.dtype)
+            found += jax.vmap(lambda m, own=own: own(m), in_axes=(GRID,))(spread)
         return found
 
-    def log_prior(self, s: Float[Array, " free"]) -> Scalar:
+    def log_prior(self, s: Free) -> Scalar:
         """Log prior density of the sampled coordinates, up to a constant."""
         c, columns = self.likelihood.objective.coordinates, jnp.asarray(self.columns)
         theta = c.theta(s)
@@ -247,24 +226,23 @@ class PosteriorDensity(eqx.Module):
         pulled = jnp.asarray(self.likelihood.objective.prior_root)[:, columns] @ theta[columns]
         return jnp.sum(stretch[columns]) - 0.5 * jnp.sum(pulled**2)
 
-    def log_density(self, white: Float[Array, " sampled"]) -> Scalar:
+    def log_density(self, white: Sampled) -> Scalar:
         """The density; minus infinity where a task has no stable equilibrium."""
-        s, offsets, systems = self.placed(self.centre + self.scale @ white)
+        s, offsets, systems = self.place(self.centre + self.scale @ white)
         found = self.log_prior(s)
         for band in self.bands:
             found += jax.nn.logsumexp(self.heights(band, s, offsets, systems))
+        objective = self.likelihood.objective
+        theta = objective.coordinates.theta(s)
         for part, bins in enumerate(self.likelihood.bins):
             if self.band_of(part) is None:
-                objective = self.likelihood.objective
-                moments = objective.parts[part].moments(
-                    jnp.asarray(objective.own(objective.coordinates.theta(s), part))
-                )
+                moments = objective.parts[part].moments(jnp.asarray(objective.own(theta, part)))
                 found += self.likelihood.of_part(part, moments, offsets[part], bins)
         return jnp.where(jnp.isfinite(found), found, -jnp.inf)
 
-    def at_frequencies(self, white: Float[Array, " sampled"]) -> tuple[Float[Array, " grid"], ...]:
+    def at_frequencies(self, white: Sampled) -> tuple[Heights, ...]:
         """Log density at every frequency of each band (up to a constant), given the rest."""
-        s, offsets, systems = self.placed(self.centre + self.scale @ white)
+        s, offsets, systems = self.place(self.centre + self.scale @ white)
         return tuple(self.heights(band, s, offsets, systems) for band in self.bands)
 
 
@@ -287,25 +265,21 @@ def density_about(
     summed = frequency_names(coordinates)
     bands = tuple(band_about(problem, peak, name) for name in summed)
     columns = tuple(i for i, name in enumerate(names) if name not in summed)
-    s, offsets = (
-        coordinates.from_theta(peak.theta[best]),
-        tuple(i for i, b in enumerate(likelihood.bins) if b is not None),
-    )
+    offsets = tuple(i for i, bins in enumerate(likelihood.bins) if bins is not None)
+    s = coordinates.from_theta(peak.theta[best])
     stretch = np.append(coordinates.stretch(s), np.ones(len(likelihood.bins)))
     sampled = [*columns, *(len(names) + i for i in offsets)]
-    covariance = np.linalg.pinv(peak.curvature[best] * stretch[:, None] * stretch, hermitian=True)[
-        np.ix_(sampled, sampled)
-    ]
+    curvature = peak.curvature[best] * stretch[:, None] * stretch
+    covariance = np.linalg.pinv(curvature, hermitian=True)[np.ix_(sampled, sampled)]
+    # what nothing determines has no variance in a pseudo-inverse
     scale = np.linalg.cholesky(covariance + 1e-10 * np.diag(np.diag(covariance)))
     centre = np.append(s, peak.offset[best])[sampled]
     made = PosteriorDensity(likelihood, bands, s, centre, scale, (), columns, offsets)
     levels = _levels(problem, made, peak.offset[best])
     if levels:
         made = dataclasses.replace(made, levels=levels)
-        turn = np.eye(len(sampled))
-        inner = np.ix_(range(len(columns)), range(len(columns)))
-        slope = np.asarray(_levelling(made, s))
-        turn[inner] = slope[np.ix_(columns, columns)]
+        turn, inner = np.eye(len(sampled)), np.s_[: len(columns), : len(columns)]
+        turn[inner] = np.asarray(_levelling(made, s))[np.ix_(columns, columns)]
         made = dataclasses.replace(made, scale=np.linalg.solve(turn, scale))
     return made, peak, best
 
@@ -316,45 +290,36 @@ def _levels(problem: FitProblem, made: PosteriorDensity, offsets: np.ndarray) ->
     c = problem.coordinates
     base = [name.partition("@")[0] for name in c.names]
     amplitudes = {name for part in problem.parts for name in amplitude_names(part.task)}
-    amplitude = [name in amplitudes for name in base]
-    open_now = np.array(amplitude) & c.positive & ~np.isfinite(c.low)
+    open_now = np.isin(base, list(amplitudes)) & c.positive & ~np.isfinite(c.low)
     s, levels = np.asarray(made.point), []
     for i, part in enumerate(problem.parts):
         loose = open_now & np.isin(np.arange(len(base)), part.columns)
-        if (
-            part.variation is None
-            or not loose.any()
-            or not isinstance(part.task.harmonic.envelope, Constant)
-        ):
+        still = isinstance(part.task.harmonic.envelope, Constant)
+        if part.variation is None or not loose.any() or not still:
             continue
         weight, variation = map(np.asarray, _weights(made, s, offsets, i))
+        # that of a noise, where there is one
         column = int(np.argmax(np.where(loose, [n != "harmonic_amplitude" for n in base], -1.0)))
+        start, sd = np.asarray(s[column]), np.asarray(c.sd[column])
         along = np.where(loose, 1 / c.sd, 0.0)
-        levels.append(
-            Level(
-                np.asarray(s[column]), np.asarray(c.sd[column]), variation, along, weight, column, i
-            )
-        )
+        levels.append(Level(start, sd, variation, along, weight, column, i))
         open_now = open_now & ~loose
     return tuple(levels)
 
 
 @kept
-def _levelling(made: PosteriorDensity, s: Array | np.ndarray) -> Array:
+def _levelling(made: PosteriorDensity, s: Numbers) -> Array:
     """How coordinates change with those that are counted from levels."""
-    return jax.jacfwd(lambda s: made.levelled(s)[0])(jnp.asarray(s))
+    return jax.jacfwd(lambda s: made.from_levels(s)[0])(jnp.asarray(s))
 
 
 @kept
 def _weights(
-    made: PosteriorDensity, point: Array | np.ndarray, offsets: Array | np.ndarray, part: int
+    made: PosteriorDensity, point: Numbers, offsets: Numbers, part: int
 ) -> tuple[Array, Array]:
     """Of the frequencies of the band that acts on a part; the log coefficient of variation with
     these."""
-    band, s = made.band_of(part), jnp.asarray(point)
-    weight = (
-        jnp.ones(1)
-        if band is None
-        else jax.nn.softmax(made.heights(band, s, jnp.asarray(offsets), {}))
-    )
+    band, s, weight = made.band_of(part), jnp.asarray(point), jnp.ones(1)
+    if band is not None:
+        weight = jax.nn.softmax(made.heights(band, s, jnp.asarray(offsets), {}))
     return weight, made.log_variation(s, part, weight)[0]

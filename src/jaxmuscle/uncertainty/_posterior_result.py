@@ -28,10 +28,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-CREDIBLE = (0.025, 0.975)
-
-
-Modes = tuple[tuple[float, float, float, float], ...]
+Mode = tuple[float, float, float, float]
+Modes = tuple[Mode, ...]
+Draws = Float[np.ndarray, "chains draws"]
+Drawn = dict[str, Draws]
+MODE = ("from_hz", "median_hz", "to_hz", "probability")
+MIXING = ("r_hat", "ess_bulk", "ess_tail")
+COLUMNS = ("quantity", "median", "2.5 %", "97.5 %", "R-hat", "ESS", "unit")
+CELLS = ("{median:.4g}", "{low:.4g}", "{high:.4g}", "{r_hat:.3f}", "{ess:.0f}")
+LINE = "  {:<24}{:>10}{:>10}{:>10}{:>7}{:>6}  {}"
+FROM_PRIOR = "* not determined by the data: it comes from the prior. Do not interpret it"
+PREDICTED = (
+    "  {}posterior-predictive chi2: p = {:.2g} (near 0: the model does not describe the data)"
+)
 
 
 class PosteriorPart(eqx.Module):
@@ -72,8 +81,8 @@ class Posterior(Shown, eqx.Module):
     success: bool
     message: str
     parts: dict[str, PosteriorPart]
-    samples: dict[str, Float[np.ndarray, "chains draws"]]
-    derived: dict[str, Float[np.ndarray, "chains draws"]]
+    samples: Drawn
+    derived: Drawn
     diagnostics: dict[str, tuple[float, float, float]]
     determined: tuple[str, ...]
     frequency_modes: dict[str, Modes]
@@ -119,7 +128,7 @@ class Posterior(Shown, eqx.Module):
         return int(self.chains.diverging.sum())
 
     @property
-    def quantities(self) -> dict[str, Float[np.ndarray, "chains draws"]]:
+    def quantities(self) -> Drawn:
         """Parameters, then derived quantities."""
         return self.samples | self.derived
 
@@ -130,17 +139,12 @@ class Posterior(Shown, eqx.Module):
             raise NotMixedError(f"{self.title}: {self.message}")
         rows = {}
         for name, draws in self.quantities.items():
-            low, middle, high = np.quantile(draws, (CREDIBLE[0], 0.5, CREDIBLE[1]))
-            rows[name] = (
-                float(draws.mean()),
-                float(draws.std(ddof=1)),
-                float(middle),
-                float(low),
-                float(high),
-            )
-        return Summary(
-            rows, self.diagnostics, self.determined, {n: self.unit(n) for n in rows}, self._told()
-        )
+            low, middle, high = np.quantile(draws, (0.025, 0.5, 0.975)).tolist()
+            spread = {"mean": float(draws.mean()), "sd": float(draws.std(ddof=1))}
+            rows[name] = {**spread, "median": middle, "low": low, "high": high}
+            rows[name] |= dict(zip(MIXING, self.diagnostics[name], strict=True))
+            rows[name] |= {"unit": self.unit(name), "determined": name in self.determined}
+        return Summary(rows, self._text())
 
     def unit(self, name: str) -> str:
         """Unit of a parameter or derived quantity."""
@@ -153,39 +157,106 @@ class Posterior(Shown, eqx.Module):
         part = self.only if target is None else self.parts[target]
         values = {}
         for name, shared in part.names.items():
-            draws = self.samples[shared]
-            value, middle, own = (
-                float(draws[chain, draw]),
-                float(np.median(draws)),
-                float(part.task[name]),
-            )
+            value, middle = self.samples[shared][chain, draw], np.median(self.samples[shared])
             # A proportional parameter keeps its ratio to the first target's.
-            values[name] = value if middle == own else value * own / middle
+            ratio = 1.0 if middle == part.task[name] else part.task[name] / middle
+            values[name] = float(value * ratio)
         return part.task.replace(**values)
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row for each draw: `chain`, `draw`, then every parameter and derived quantity;
         `summary()` has a table, too."""
         chain, draw = np.indices(self.chains.log_density.shape)
-        return frame(
-            {
-                name: np.ravel(x)
-                for name, x in ({"chain": chain, "draw": draw} | self.quantities).items()
-            }
-        )
+        columns = {"chain": chain, "draw": draw} | self.quantities
+        return frame({name: np.ravel(x) for name, x in columns.items()})
 
     def to_datatree(self) -> "xarray.DataTree":
         """ArviZ's groups posterior, posterior_predictive, sample_stats, observed_data, over chain,
-        draw, frequency."""
-        return datatree(self)
+        draw, frequency.
+
+        With several targets the spectra are called "expected@target" and so on, over
+        "frequency@target".
+        """
+        import xarray
+
+        made, pair = self.chains, ("chain", "draw")
+        axes = {name: np.arange(n) for name, n in zip(pair, made.log_density.shape, strict=True)}
+        named = {
+            name: (pair, x, {"units": self.unit(name), "determined": int(name in self.determined)})
+            for name, x in self.quantities.items()
+        }
+        stats = {
+            "lp": made.log_density,
+            "acceptance_rate": made.acceptance,
+            "n_steps": made.steps,
+            "diverging": made.diverging,
+        }
+        about = {
+            "success": int(self.success),
+            "message": self.message,
+            "target": self.title,
+            "seed": str(self.seed),
+        }
+        about |= {f"version_{name}": number for name, number in self.versions.items()}
+        bins, expected, drawn, measured = {}, {}, {}, {}
+        for name, part in self.parts.items():
+            end = f"@{name}" if len(self.parts) > 1 else ""
+            bin_axis, power = f"frequency{end}", f"proportional_power{end}"
+            bins[bin_axis] = bin_axis, np.asarray(part.target.frequency), {"units": "Hz"}
+            expected[f"expected{end}"] = (*pair, bin_axis), part.replicates.expected
+            drawn[power] = (*pair, bin_axis), part.replicates.power
+            measured[power] = bin_axis, np.asarray(part.target.proportional_power)
+        groups = {
+            "/": xarray.Dataset(attrs=about),
+            "/posterior": xarray.Dataset(named | expected, axes | bins),
+            "/posterior_predictive": xarray.Dataset(drawn, axes | bins),
+            "/sample_stats": xarray.Dataset(
+                {name: (pair, x) for name, x in stats.items()}, axes, {"step_size": made.step_size}
+            ),
+            "/observed_data": xarray.Dataset(measured, bins),
+        }
+        return xarray.DataTree.from_dict(groups)
 
     def save(self, path: str | Path) -> None:
         """Write the draws as netCDF, or a summary as JSON if the name ends in .json; replaces a
         file in one step."""
         if Path(path).suffix == ".json":
-            write_json(path, summary_table(self))
-        else:
-            write_netcdf(path, self)
+            return write_json(path, self._summary_table())
+        tree = self.to_datatree()
+        with replacing(path, room=tree.nbytes + 2**18) as temporary:
+            tree.to_netcdf(temporary, engine="h5netcdf")
+        return None
+
+    def _summary_table(self) -> dict[str, Any]:
+        """What `posterior.json` holds; `summary` is null where the chains did not mix."""
+        modes, p_values, about = {}, {}, {}
+        for name, found in self.frequency_modes.items():
+            modes[name] = [dict(zip(MODE, mode, strict=True)) for mode in found]
+        for name, part in self.parts.items():
+            p_values[name] = part.replicates.p_value
+            kinds = {"task": type(part.task).__name__, "noise": type(part.task.noise).__name__}
+            about[name] = {"target": part.target.name} | kinds
+        single = len(self.parts) == 1
+        if single:
+            (about,), (p_values,) = about.values(), p_values.values()
+            modes = next(iter(modes.values()), [])
+        return {
+            "format": 1,
+            "success": self.success,
+            "message": self.message,
+            **(about if single else {"parts": about}),
+            "divergences": self.divergences,
+            "diagnostics": {
+                name: dict(zip(MIXING, found, strict=True))
+                for name, found in self.diagnostics.items()
+            },
+            "summary": self.summary().rows if self.success else None,
+            "modes": modes,
+            "predictive_p_value": p_values if self.success else None,
+            "seed": self.seed,
+            "settings": self.settings,
+            "versions": self.versions,
+        }
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Corner figure of what the data determine. Raises `NotMixedError` if the chains did not
@@ -202,12 +273,10 @@ class Posterior(Shown, eqx.Module):
         return plot.predictive(self, ax, target)
 
     def _card(self) -> Card:
-        if not self.success:
-            return Card(self._told())
-        shown = self.summary()._card()
-        return shown._replace(text=self._told())
+        text = self._text()
+        return self.summary()._card()._replace(text=text) if self.success else Card(text)
 
-    def _told(self) -> str:
+    def _text(self) -> str:
         """The posterior in a few lines."""
         count, draws = self.chains.log_density.shape
         lines = [
@@ -215,182 +284,45 @@ class Posterior(Shown, eqx.Module):
             f"  {self.message}",
             f"  {count} chains of {draws} draws, {self.divergences} divergences",
         ]
-        if self.success:
-            for name, part in self.parts.items():
-                whose = f"{name}: " if len(self.parts) > 1 else ""
-                lines.append(
-                    f"  {whose}posterior-predictive chi2: p = {part.replicates.p_value:.2g} (near"
-                    " 0: the model does not describe the data)"
-                )
-            for name, modes in self.frequency_modes.items():
-                if len(modes) > 1:
-                    told = ", ".join(
-                        f"{middle:.2f} Hz ({100 * share:.0f} %)" for _, middle, _, share in modes
-                    )
-                    lines.append(f"  {name} has several modes: {told}")
+        if not self.success:
+            return folded(lines)
+        for name, part in self.parts.items():
+            whose = f"{name}: " * (len(self.parts) > 1)
+            lines += [PREDICTED.format(whose, part.replicates.p_value)]
+        for name, modes in self.frequency_modes.items():
+            listed = ", ".join(f"{mode[1]:.2f} Hz ({100 * mode[3]:.0f} %)" for mode in modes)
+            lines += [f"  {name} has several modes: {listed}"] * (len(modes) > 1)
         return folded(lines)
 
 
 class Summary(Shown, eqx.Module):
-    """Table of a posterior: `rows` {name: (mean, sd, median, 2.5 %, 97.5 %)}; prints itself."""
+    """Table of a posterior: `rows` {name: {mean, sd, median, low (2.5 %), high (97.5 %), r_hat,
+    ess_bulk, ess_tail, unit, determined}}; prints itself."""
 
-    rows: dict[str, tuple[float, float, float, float, float]]
-    diagnostics: dict[str, tuple[float, float, float]]
-    determined: tuple[str, ...]
-    units: dict[str, str]
+    rows: dict[str, dict[str, Any]]
     title: str
 
-    def __getitem__(self, name: str) -> dict[str, float]:
+    def __getitem__(self, name: str) -> dict[str, Any]:
         """What is known of one quantity. Raises `ValueError` for an unknown name."""
         if name not in self.rows:
             raise ValueError(
                 f"unknown quantity {name!r} of the posterior: {choices(name, self.rows)}"
             )
-        keys = ("mean", "sd", "median", "low", "high", "r_hat", "ess_bulk", "ess_tail")
-        return dict(zip(keys, (*self.rows[name], *self.diagnostics[name]), strict=True))
+        return self.rows[name]
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row for each quantity: `quantity`, what `summary[name]` has (`mean` to `ess_tail`),
-        `unit`, `determined`."""
-        return frame(
-            [
-                {
-                    "quantity": n,
-                    **self[n],
-                    "unit": self.units[n],
-                    "determined": n in self.determined,
-                }
-                for n in self.rows
-            ]
-        )
+        """A row for each quantity: `quantity`, and what `summary[name]` has (`mean` to
+        `determined`)."""
+        return frame([{"quantity": name} | row for name, row in self.rows.items()])
 
     def _card(self) -> Card:
-        columns = ("quantity", "median", "2.5 %", "97.5 %", "R-hat", "ESS", "unit")
-        rows, lines = (
-            [],
-            [
-                self.title,
-                f"  {'':<24}{'median':>10}{'2.5 %':>10}{'97.5 %':>10}{'R-hat':>7}{'ESS':>6}  unit",
-            ],
-        )
-        for name, (_, _, middle, low, high) in self.rows.items():
-            r_hat, bulk, tail = self.diagnostics[name]
-            mark = "" if name in self.determined else "*"
-            unit = "" if self.units[name] == "1" else self.units[name]
-            cells = (
-                f"{middle:.4g}",
-                f"{low:.4g}",
-                f"{high:.4g}",
-                f"{r_hat:.3f}",
-                f"{min(bulk, tail):.0f}",
-            )
-            rows.append((name + mark, *cells, unit))
-            numbers = "".join(
-                f"{cell:>{wide}}" for cell, wide in zip(cells, (10, 10, 10, 7, 6), strict=True)
-            )
-            lines.append(f"  {name + mark:<24}{numbers}  {unit}")
-        said = ("* not determined by the data: it comes from the prior. Do not interpret it",)
-        remarks = said * any(name not in self.determined for name in self.rows)
+        rows = []
+        for name, row in self.rows.items():
+            ess, unit = min(row["ess_bulk"], row["ess_tail"]), row["unit"]
+            cells = (cell.format(ess=ess, **row) for cell in CELLS)
+            mark = "*" * (not row["determined"])
+            rows.append((name + mark, *cells, "" if unit == "1" else unit))
+        remarks = (FROM_PRIOR,) * any(not row["determined"] for row in self.rows.values())
+        lines = [self.title, *(LINE.format(*row) for row in (("", *COLUMNS[1:]), *rows))]
         text = "\n".join([*lines, *(f"  {remark}" for remark in remarks)])
-        return Card(text, self.title.partition("\n")[0], columns, tuple(rows), remarks)
-
-
-KEYS = ("r_hat", "ess_bulk", "ess_tail")
-
-
-def datatree(found: Any) -> "xarray.DataTree":
-    """Groups posterior, posterior_predictive, sample_stats, observed_data.
-
-    With several targets the spectra are called "expected@target" and so on, over
-    "frequency@target".
-    """
-    import xarray
-
-    chains, draws = found.chains.log_density.shape
-    axes = {"chain": np.arange(chains), "draw": np.arange(draws)}
-    pair = ("chain", "draw")
-    named = {
-        name: (pair, x, {"units": found.unit(name), "determined": int(name in found.determined)})
-        for name, x in found.quantities.items()
-    }
-    made = found.chains
-    stats = {
-        "lp": made.log_density,
-        "acceptance_rate": made.acceptance,
-        "n_steps": made.steps,
-        "diverging": made.diverging,
-    }
-    told = {
-        "success": int(found.success),
-        "message": found.message,
-        "target": found.title,
-        "seed": str(found.seed),
-    }
-    told |= {f"version_{name}": number for name, number in found.versions.items()}
-    bins, expected, drawn, measured = {}, {}, {}, {}
-    for name, part in found.parts.items():
-        end = f"@{name}" if len(found.parts) > 1 else ""
-        bin_axis, power = f"frequency{end}", np.asarray(part.target.proportional_power)
-        bins[bin_axis] = (bin_axis, np.asarray(part.target.frequency), {"units": "Hz"})
-        expected[f"expected{end}"] = (*pair, bin_axis), part.replicates.expected
-        drawn[f"proportional_power{end}"] = (*pair, bin_axis), part.replicates.power
-        measured[f"proportional_power{end}"] = bin_axis, power
-    groups = {
-        "/": xarray.Dataset(attrs=told),
-        "/posterior": xarray.Dataset(named | expected, axes | bins),
-        "/posterior_predictive": xarray.Dataset(drawn, axes | bins),
-        "/sample_stats": xarray.Dataset(
-            {name: (pair, x) for name, x in stats.items()}, axes, {"step_size": made.step_size}
-        ),
-        "/observed_data": xarray.Dataset(measured, bins),
-    }
-    return xarray.DataTree.from_dict(groups)
-
-
-def write_netcdf(path: str | Path, found: Any) -> None:
-    """Write the tree to a temporary file beside `path`, then rename it."""
-    tree = datatree(found)
-    with replacing(path, room=tree.nbytes + 2**18) as temporary:
-        tree.to_netcdf(temporary, engine="h5netcdf")
-
-
-def summary_table(found: Any) -> dict[str, Any]:
-    """What `posterior.json` holds; `summary` is null where the chains did not mix."""
-    rows = None
-    if found.success:
-        summary = found.summary()
-        rows = {
-            n: summary[n] | {"unit": found.unit(n), "determined": n in found.determined}
-            for n in summary.rows
-        }
-    single = len(found.parts) == 1
-    keys = ("from_hz", "median_hz", "to_hz", "probability")
-    modes = {
-        name: [dict(zip(keys, m, strict=True)) for m in modes]
-        for name, modes in found.frequency_modes.items()
-    }
-    p_values = {name: part.replicates.p_value for name, part in found.parts.items()}
-    about = {
-        name: {
-            "target": part.target.name,
-            "task": type(part.task).__name__,
-            "noise": type(part.task.noise).__name__,
-        }
-        for name, part in found.parts.items()
-    }
-    return {
-        "format": 1,
-        "success": found.success,
-        "message": found.message,
-        **(next(iter(about.values())) if single else {"parts": about}),
-        "divergences": found.divergences,
-        "diagnostics": {n: dict(zip(KEYS, d, strict=True)) for n, d in found.diagnostics.items()},
-        "summary": rows,
-        "modes": next(iter(modes.values()), []) if single else modes,
-        "predictive_p_value": (
-            None if not found.success else found.replicates.p_value if single else p_values
-        ),
-        "seed": found.seed,
-        "settings": found.settings,
-        "versions": found.versions,
-    }
+        return Card(text, self.title.partition("\n")[0], COLUMNS, tuple(rows), remarks)

@@ -1,7 +1,7 @@
 """Profile likelihood: how far one quantity can move while everything else follows."""
 
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -36,6 +36,10 @@ STEPS = np.array([0.4, 0.8, 1.2, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0])
 PER_BIN = 4
 MODES, COUNTS = 4, 8.0
 HELD = 0.02  # standard errors that a derived quantity is held to
+KINDS = {True: "profile of likelihood and prior", False: "profile likelihood, without priors"}
+Ends = tuple[float | None, float | None]  # of an interval, None where the data leave it open
+OPEN: Ends = (None, None)
+Rows = Float[np.ndarray, "rows free"]
 
 
 class Profile(Printed, Result, eqx.Module):
@@ -54,7 +58,7 @@ class Profile(Printed, Result, eqx.Module):
     stderr: float
     values: Float[np.ndarray, " points"]
     rise: Float[np.ndarray, " points"]
-    intervals: tuple[tuple[float | None, float | None], ...]
+    intervals: tuple[Ends, ...]
     level: float
     with_priors: bool
 
@@ -83,32 +87,21 @@ class Profile(Printed, Result, eqx.Module):
 
     def __str__(self) -> str:
         unit = "" if self.unit == "1" else f" {self.unit}"
-        percent = f"{100 * self.level:g} %"
-        if all(low is None and high is None for low, high in self.intervals):
-            span = (
-                f"the data set it no limits between {self.values[0]:.3g} and"
-                f" {self.values[-1]:.3g}{unit}"
-            )
-        else:
-            span = f"{percent} interval " + " and ".join(
-                _in_words(*ends, unit) for ends in self.intervals
-            )
-        kind = (
-            "profile of likelihood and prior"
-            if self.with_priors
-            else "profile likelihood, without priors"
+        ends = " and ".join(
+            _in_words(low, high, unit) for low, high in self.intervals if (low, high) != OPEN
         )
-        return folded(
-            [
-                f"{self.name} = {self.value:.4g}{unit}: {span} ({kind}); ± {self.stderr:.2g} by"
-                " curvature"
-            ]
+        first, last = self.values[[0, -1]]
+        span = (
+            f"{100 * self.level:g} % interval {ends}"
+            if ends
+            else f"the data set it no limits between {first:.3g} and {last:.3g}{unit}"
         )
+        kind = KINDS[self.with_priors]
+        about = f"{self.name} = {self.value:.4g}{unit}: {span} ({kind})"
+        return folded([f"{about}; ± {self.stderr:.2g} by curvature"])
 
 
 def _in_words(low: float | None, high: float | None, unit: str) -> str:
-    if low is None and high is None:
-        return "open"
     if low is None:
         return f"below {high:.4g}{unit} (open downwards)"
     if high is None:
@@ -163,71 +156,87 @@ def profile(
         peak, best = highest(
             problem, likelihood, problem.theta_of(tuple(result.tasks.values())), precision
         )
-        scan = _parameter if name in names else _derived
-        value, stderr, values, height, cost = scan(problem, likelihood, peak, best, precision, name)
-    order = np.argsort(values, kind="stable")
-    values, height, cost = values[order], height[order], cost[order]
+        # Of two names of one thing the free parameter: it is held exactly.
+        scan = (_parameter if name in names else _derived)(problem, likelihood, peak, best, name)
+        found = maximise(likelihood, scan.theta, precision, **scan.held)
+        values, own = scan.read(found.theta), scan.read(peak.theta[[best]])
+    # What a penalty that holds the quantity adds is no cost of its own.
+    cost = 0.5 * np.sum((found.theta @ precision) * found.theta, axis=1) - found.log_likelihood
+    cost = np.where(np.isfinite(found.cost), cost, np.inf)
+    table = np.stack([values, found.log_likelihood, cost]).reshape(3, -1, scan.points)
+    # of the maxima with the same held value the highest
+    table = table[:, np.argmin(table[2], axis=0), np.arange(scan.points)]
+    top = [own, peak.log_likelihood[[best]], peak.cost[[best]]]
+    table = np.concatenate([table[:, np.isfinite(table[2])], top], axis=1)
+    values, places = np.unique(table[0], return_index=True)
+    _, height, cost = table[:, places]
     rise = 2 * (cost - cost.min()) if with_priors else 2 * (height.max() - height)
-    intervals = _intervals(values, rise, float(scipy.stats.chi2.ppf(level, 1)))
-    unit = unit_of(name, problem.parts[problem.where(name)[0]].task.output_unit) or "1"
     return Profile(
-        name, unit, problem.title, value, stderr, values, rise, intervals, level, with_priors
+        name,
+        unit_of(name, problem.parts[problem.where(name)[0]].task.output_unit) or "1",
+        problem.title,
+        float(own[0]),
+        float(scan.stderr),
+        values,
+        rise,
+        _intervals(values, rise, float(scipy.stats.chi2.ppf(level, 1))),
+        level,
+        with_priors,
     )
 
 
-Scan = tuple[float, float, np.ndarray, np.ndarray, np.ndarray]
+class Scan(NamedTuple):
+    """Where a quantity is held: from which θ, and how; what it is at any θ; its standard error by
+    the curvature. `points` values follow one another, for each maximum anew."""
+
+    theta: Rows
+    points: int
+    held: dict[str, Any]
+    read: Callable[[Rows], np.ndarray]
+    stderr: float
 
 
 def _parameter(
-    problem: FitProblem,
-    likelihood: Likelihood,
-    peak: Maximum,
-    best: int,
-    precision: np.ndarray,
-    name: str,
+    problem: FitProblem, likelihood: Likelihood, peak: Maximum, best: int, name: str
 ) -> Scan:
     """A free parameter held at θ_j."""
-    coordinates = problem.coordinates
-    j = coordinates.names.index(name)
-    centre, sd = peak.theta[best, j], np.sqrt(peak.covariance(best)[j, j])
-    if name in frequency_names(coordinates):
+    del likelihood
+    c = problem.coordinates
+    j = c.names.index(name)
+    sd, own = np.sqrt(peak.covariance(best)[j, j]), c.values_of(peak.theta[[best]])[0]
+    if name in frequency_names(c):
         acting = [part.target.frequency for part in problem.acting(name)]
         low, high = min(f[0] for f in acting), max(f[-1] for f in acting)
         held = np.arange(low, high + 1e-9, problem.finest.settings.resolution / PER_BIN)
-        held = coordinates.theta_of(
-            name, np.append(held, coordinates.values(peak.theta[best])[name])
-        )
+        held = c.theta_of(name, np.append(held, own[j]))
     else:
-        held = _outward(centre, sd, 1 / coordinates.sd[j])
-    theta = np.concatenate([_along(peak, i, j, held) for i in _modes(problem, peak, name)])
+        held = _outward(peak.theta[best, j], sd, 1 / c.sd[j])
+    # on the ridge of each maximum
+    theta = np.concatenate(
+        [
+            _along(peak, i, held - peak.theta[i, j], np.eye(len(c.names))[j])
+            for i in _modes(problem, peak, name)
+        ]
+    )
+    theta[:, j] = np.resize(held, len(theta))
     moving = np.ones_like(theta)
     moving[:, j] = 0.0
-    found = maximise(likelihood, theta, precision, moving=moving)
-    values = coordinates.values_of(found.theta)[:, j]
-    slope = coordinates.slope(coordinates.values_of(peak.theta[[best]])[0])[j]
-    top = float(coordinates.values_of(peak.theta[[best]])[0, j])
-    value, height, cost = _best_of(values, found.log_likelihood, found.cost, len(held))
-    value, height, cost = (
-        np.append(a, b)
-        for a, b in zip(
-            (value, height, cost), (top, peak.log_likelihood[best], peak.cost[best]), strict=True
-        )
-    )
-    return top, float(sd * slope), *_unique(value, height, cost)
+    slope = c.slope(own)[j]
+    return Scan(theta, len(held), {"moving": moving}, lambda at: c.values_of(at)[:, j], sd * slope)
 
 
 def _derived(
-    problem: FitProblem,
-    likelihood: Likelihood,
-    peak: Maximum,
-    best: int,
-    precision: np.ndarray,
-    name: str,
+    problem: FitProblem, likelihood: Likelihood, peak: Maximum, best: int, name: str
 ) -> Scan:
     """A derived quantity held by a stiff penalty; its own value where that ends."""
     part, quantity = problem.where(name)
-    tables = quantities(likelihood.objective, expand(likelihood.objective, peak.theta))
-    q, g = (table[part][quantity] for table in tables)
+
+    def read(theta: Rows) -> list[np.ndarray]:
+        """Its values and slopes."""
+        tables = quantities(likelihood.objective, expand(likelihood.objective, theta))
+        return [table[part][quantity] for table in tables]
+
+    q, g = read(peak.theta)
     if not np.any(g[best]):
         raise ValueError(
             f"{name} follows from none of the free parameters"
@@ -237,55 +246,30 @@ def _derived(
     top, rise = (np.log(q), g / q[:, None]) if log else (q, g)
     spread = np.sqrt(rise[best] @ peak.covariance(best) @ rise[best])
     held = _outward(top[best], spread, FURTHEST if log else np.inf)
-    rows = []
-    for i in _modes(problem, peak, name):
-        toward = peak.covariance(i) @ rise[i]
-        rows.append(peak.theta[i] + np.outer(held - top[i], toward / (rise[i] @ toward)))
-    theta = np.clip(np.concatenate(rows), -8, 8)
-    pin = Pin(
-        part,
-        quantity,
-        np.tile(held, len(rows)),
-        HELD * min(spread, FURTHEST) if log else HELD * spread,
-        log,
+    theta = np.concatenate(
+        [_along(peak, i, held - top[i], rise[i]) for i in _modes(problem, peak, name)]
     )
-    found = maximise(likelihood, theta, precision, pin=pin, max_steps=100)
-    seen = quantities(likelihood.objective, expand(likelihood.objective, found.theta))[0][part][
-        quantity
-    ]
-    pulled = np.sum((found.theta @ precision) * found.theta, axis=1)
-    cost = 0.5 * pulled - found.log_likelihood
-    value, height, cost = _best_of(
-        seen, found.log_likelihood, np.where(np.isfinite(found.cost), cost, np.inf), len(held)
-    )
-    value, height, cost = (
-        np.append(a, b)
-        for a, b in zip(
-            (value, height, cost),
-            (q[best], peak.log_likelihood[best], peak.cost[best]),
-            strict=True,
-        )
-    )
-    return float(q[best]), float(spread * (q[best] if log else 1.0)), *_unique(value, height, cost)
+    width = HELD * (min(spread, FURTHEST) if log else spread)
+    pin = Pin(part, quantity, np.resize(held, len(theta)), width, log)
+    stderr = spread * (q[best] if log else 1.0)
+    return Scan(theta, len(held), {"pin": pin, "max_steps": 100}, lambda at: read(at)[0], stderr)
 
 
 def _outward(centre: float, sd: float, most: float) -> np.ndarray:
     """Points about the maximum; in a logarithm (`most` finite) on to a hundredth and a
     hundredfold."""
-    step = min(sd, most)
-    steps = step * STEPS
+    steps = min(sd, most) * STEPS
     if np.isfinite(most):
         steps = np.append(steps, [far * most for far in FAR if far * most > 1.2 * steps[-1]])
     return centre + np.concatenate([-steps[::-1], steps])
 
 
-def _along(peak: Maximum, i: int, j: int, held: np.ndarray) -> np.ndarray:
-    """θ on the ridge of one maximum with the coordinate j held."""
-    covariance = peak.covariance(i)
-    theta = peak.theta[i] + np.outer(held - peak.theta[i, j], covariance[:, j] / covariance[j, j])
-    theta = np.clip(theta, -8, 8)
-    theta[:, j] = held
-    return theta
+def _along(peak: Maximum, i: int, steps: np.ndarray, slope: np.ndarray) -> Rows:
+    """θ from one maximum on, where a quantity of this slope has changed by the steps and all else
+    is as likely as it can be."""
+    toward = peak.covariance(i) @ slope
+    # beyond 8 prior standard deviations no task can be computed
+    return np.clip(peak.theta[i] + np.outer(steps, toward / (slope @ toward)), -8, 8)
 
 
 def _modes(problem: FitProblem, peak: Maximum, name: str) -> list[int]:
@@ -297,38 +281,13 @@ def _modes(problem: FitProblem, peak: Maximum, name: str) -> list[int]:
     )
 
 
-def _best_of(
-    values: np.ndarray, height: np.ndarray, cost: np.ndarray, count: int
-) -> tuple[np.ndarray, ...]:
-    """Of the maxima with the same held value, the highest."""
-    table = cost.reshape(-1, count)
-    pick = np.argmin(np.where(np.isfinite(table), table, np.inf), axis=0), np.arange(count)
-    chosen = tuple(x.reshape(-1, count)[pick] for x in (values, height, cost))
-    fine = np.isfinite(chosen[2])
-    return tuple(x[fine] for x in chosen)
-
-
-def _unique(
-    values: np.ndarray, height: np.ndarray, cost: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    values, index = np.unique(values, return_index=True)
-    return values, height[index], cost[index]
-
-
-def _intervals(
-    values: np.ndarray, rise: np.ndarray, most: float
-) -> tuple[tuple[float | None, float | None], ...]:
+def _intervals(values: np.ndarray, rise: np.ndarray, most: float) -> tuple[Ends, ...]:
     """Where the rise is below a bound; its root is nearly linear, so crossings are interpolated in
     it."""
     root, bound = np.sqrt(np.maximum(rise, 0.0)), np.sqrt(most)
     inside = root <= bound
-    found: list[tuple[float | None, float | None]] = []
-    edges = np.flatnonzero(np.diff(inside.astype(int)))
-    crossings = [
-        float(values[i] + (bound - root[i]) / (root[i + 1] - root[i]) * (values[i + 1] - values[i]))
-        for i in edges
-    ]
+    i = np.flatnonzero(np.diff(inside.astype(int)))
+    share = (bound - root[i]) / (root[i + 1] - root[i])
+    crossings = (values[i] + share * (values[i + 1] - values[i])).tolist()
     ends: list[Any] = [None] * bool(inside[0]) + crossings + [None] * bool(inside[-1])
-    for k in range(0, len(ends), 2):
-        found.append((ends[k], ends[k + 1]))
-    return tuple(found)
+    return tuple(zip(ends[::2], ends[1::2], strict=True))
