@@ -150,7 +150,7 @@ def test_every_way_to_read_takes_a_baseline(tmp_path):
         jm.load_recording(path, baseline="0:1"),
         jm.load_recordings([path], baseline=(0, 1))[0],
         jm.Recording.from_dataframe(frame, baseline=(0.0, 1.0)),
-        jm.Recording.from_array(HELD + LIMB, RATE, baseline=(0, 1)),
+        jm.Recording(HELD + LIMB, RATE, baseline=(0, 1)),
     ]
     for one in found:
         np.testing.assert_allclose(one.whole, found[-1].whole, atol=1e-9)

@@ -507,11 +507,7 @@ def test_what_is_taken_off_is_as_nonlinear_as_the_recording(share):
     with jax.enable_x64(True):
         recording, own = specimen(3, answer)
         seen = seen_with(muscle, [recording])
-    alone = (
-        jm.Recording.from_array(own, RATE)
-        .steady(recording.force.window)
-        .target(settings=seen.settings)
-    )
+    alone = jm.Recording(own, RATE).steady(recording.force.window).target(settings=seen.settings)
     apart = np.log(seen.proportional_power / alone.proportional_power)
     # left in, the nonlinear answer more than doubles the power near 5 Hz
     assert np.sqrt(np.mean(apart**2)) < 0.1

@@ -277,7 +277,7 @@ class PerturbedRecording(Printed, eqx.Module):
             if window is not None:
                 raise
             found = self._without_answer().steady()  # or it raises the same
-            alone = self.force._with(self.force.whole, self.rate, None, found.notices)
+            alone = self.force._with(window=None, notices=found.notices)
             held = alone.steady(found.window)
         moved = self.displacement.steady("all" if held.window is None else held.window)
         return PerturbedRecording(
@@ -292,9 +292,7 @@ class PerturbedRecording(Printed, eqx.Module):
         columns = np.stack([np.ones_like(x), x, speed, np.gradient(speed, 1 / self.rate)], axis=1)
         columns /= np.linalg.norm(columns, axis=0)
         sizes = np.linalg.lstsq(columns, self.force.whole, rcond=None)[0]
-        return self.force._with(
-            self.force.whole - columns[:, 1:] @ sizes[1:], self.rate, None, self.force.notices
-        )
+        return self.force._with(samples=self.force.whole - columns[:, 1:] @ sizes[1:], window=None)
 
     def frequency_response(
         self, settings: SpectrumSettings | str | None = None

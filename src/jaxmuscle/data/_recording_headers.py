@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ._recording_body import is_value
 from ._text_tables import is_number, number_in, width_remedy
-from ._units import known_unit, quantity_of, seconds
+from ._units import known_unit, seconds
 from .dialects._delsys import rates_in
 from .dialects._dialect import Above, Head
 from .dialects._dialects import DIALECTS
@@ -49,10 +49,10 @@ def _names(above: Above) -> Head:
             f"{above.file}, line {number + 1}: {width} of {len(row)} columns found;"
             f" {width_remedy(above.delimiter)}"
         )
-    for name, cell in zip(row, row, strict=True):
+    for cell in row:
         if cell and is_value(cell, above.delimiter):
             raise ValueError(
-                f"{above.file}, line {number}: {name!r} cannot be the name of a column; `skip_rows`"
+                f"{above.file}, line {number}: {cell!r} cannot be the name of a column; `skip_rows`"
                 " leaves lines out"
             )
     units: Sequence[str] = ()
@@ -66,54 +66,46 @@ def _names(above: Above) -> Head:
         else:
             break
         rows = [*rows[:-2], before]
-    names = rows[-1]
-    units = units or _units_as_names(names)
-    said = ("rates as the row below the names says",)
-    return (
-        Head(names, units, rates=rates, notices=said)
-        if rates
-        else _with_rate(Head(names, units), above)
-    )
+    head = Head(rows[-1], units or _units_as_names(rows[-1]))
+    if not rates:
+        return _with_rate(head, above)
+    return head._replace(rates=rates, notices=("rates as the row below the names says",))
 
 
 def _units_as_names(names: list[str]) -> Sequence[str]:
     """What a dynamometer calls its columns; the first alone if it can be nothing but a unit of
     times, as "min" and "s" can."""
     step = seconds(names[0])
-    several = step is not None and sum(map(_is_unit, names)) > len(names) / 2
-    return names if several else names[:1] if step is not None and step < 1 else ()
+    if step is None:
+        return ()
+    several = sum(map(_is_unit, names)) > len(names) / 2
+    return names if several else names[:1] if step < 1 else ()
 
 
 def _with_rate(head: Head, above: Above) -> Head:
-    rate, said = _stated_rate(above)
+    rate, line = _stated_rate(above)
     if not rate:
         return head
-    return head._replace(rate=rate, notices=(f"rate {rate:g} Hz, as the header says: {said}",))
+    return head._replace(rate=rate, notices=(f"rate {rate:g} Hz, as the header says: {line}",))
 
 
 def _joined(row: list[str], width: int) -> list[str]:
     """Names in which a bracket was cut off by the blank before it."""
     if len(row) <= width:
         return row
-    found: list[str] = []
-    for cell in row:
-        found = (
-            [*found[:-1], f"{found[-1]} {cell}"] if cell[:1] == "(" and found else [*found, cell]
-        )
-    return found
+    return re.sub("\0(?=[(])", " ", "\0".join(row)).split("\0")
 
 
 def _is_unit(cell: str) -> bool:
-    return bool(known_unit(cell) or seconds(cell) or quantity_of(cell))
+    return bool(known_unit(cell) or seconds(cell))
 
 
 def _are_units(row: list[str], names: list[str]) -> bool:
     """Whether a row below names holds their units: one is known, or it leaves the first out, as
     names do not."""
     there = [cell for cell in row if cell]
-    return any(known_unit(cell) or seconds(cell) for cell in there) or (
-        bool(there) and not row[0] and all(names) and all(map(_UNITLIKE.fullmatch, there))
-    )
+    alike = there and all(map(_UNITLIKE.fullmatch, there))
+    return any(map(_is_unit, there)) or bool(alike and not row[0] and all(names))
 
 
 def _stated_rate(above: Above) -> tuple[float | None, str]:

@@ -10,7 +10,8 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-from jaxmuscle._common.arguments import require
+from jaxmuscle._common.arguments import is_real, require
+from jaxmuscle._common.text import listed
 
 from ._recording_table import Table, bare, find
 from ._units import name_and_unit, seconds
@@ -42,7 +43,7 @@ class Clock(NamedTuple):
 
     name: str
     scale: float | None
-    guessed: bool
+    guessed: bool = False
     used: bool = True
 
 
@@ -111,19 +112,12 @@ def clock(table: Table, asked: str | int | None = None, column: str | None = Non
     if str(asked).casefold() == "none" and asked not in (None, *table.columns):
         found = clock(table, None, column)
         return None if found is None else found._replace(used=False)
-    if asked is not None:
-        name = find(table, asked, "time")
-        return Clock(name, _scale(table, name), False)
-    own = table.clocks.get(column or "")
-    if own is not None:
-        return Clock(own, _scale(table, own), False)
-    called = [name for name in table.columns if _TIME.fullmatch(bare(name))]
-    timed = [
-        *called,
-        *(name for name in table.columns if seconds(table.units.get(name)) is not None),
-    ]
-    if timed:
-        return Clock(timed[0], _scale(table, timed[0]), False)
+    own = table.clocks.get(column or "") if asked is None else find(table, asked, "time")
+    called = (name for name in table.columns if _TIME.fullmatch(bare(name)))
+    timed = (name for name in table.columns if seconds(table.units.get(name)) is not None)
+    name = own or next(itertools.chain(called, timed), None)
+    if name is not None:
+        return Clock(name, _scale(table, name))
     first = next(iter(table.columns))
     if table.rates or len(table.columns) < 2 or first in (*table.units, *table.words):
         return None
@@ -133,7 +127,7 @@ def clock(table: Table, asked: str | int | None = None, column: str | None = Non
     steps = np.diff(time)
     usual = float(np.median(steps))
     even = _departure(time)[0] or np.mean(np.abs(steps - usual) < 0.5 * usual) > 0.9
-    return Clock(first, None, True) if even and usual != 1 else None  # steps of 1 are a counter
+    return Clock(first, None, guessed=True) if even and usual != 1 else None  # 1: a counter
 
 
 def _scale(table: Table, name: str) -> float | None:
@@ -158,10 +152,8 @@ def sampling(
     **Raises:** `ValueError` if there is no rate, and if the rate given contradicts the times.
     """
     if rate is not None:
-        number = isinstance(rate, int | float | np.number) and not isinstance(rate, bool)
-        require(
-            number and 0 < rate < math.inf, "rate", rate, "give samples per second [Hz], above 0"
-        )
+        remedy = "give samples per second [Hz], above 0"
+        require(is_real(rate) and rate > 0, "rate", rate, remedy)
     stated = table.rates.get(name)
     words: list[str] = []
     if time is not None and time.name != name:
@@ -169,7 +161,6 @@ def sampling(
             words = [f"the times in column {time.name} are left out as asked: rows count as even"]
         elif table.columns[time.name]().size == rows >= 2:
             return _timed(table, time, rate, longest)
-    whole = [Part(0.0, slice(0, rows))]
     if rate is None and stated is None:
         why = "time='none' leaves the times out" if words else "no time column found"
         raise ValueError(
@@ -177,7 +168,7 @@ def sampling(
         )
     if rate is not None and stated is not None and abs(rate / stated - 1) > RATE_TOLERANCE:
         words.append(f"rate {rate:g} Hz as asked; the file states {stated:g} Hz")
-    return Sampling(float(rate or stated or 0.0), words, whole)
+    return Sampling(float(rate or stated or 0.0), words, [Part(0.0, slice(0, rows))])
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of times that no recording has: they are refused
@@ -367,21 +358,21 @@ def _with_words(
     parts: list[Part], time: Float[np.ndarray, " rows"]
 ) -> tuple[list[Part], list[str]]:
     """The parts, and what to say of missing rows and of pauses."""
-    uneven, words = _is_uneven(parts), []
-    holes = [(p, np.diff(np.asarray(p.position))) for p in parts]
-    least = WIDE if uneven else 1
-    missing = round(sum(float(np.sum(np.round(d[d > least]) - 1)) for _, d in holes))
+    words, missing, first = [], 0, math.inf
+    least = WIDE if _is_uneven(parts) else 1
+    for part in parts:
+        steps = np.diff(np.asarray(part.position))
+        holes = np.flatnonzero(steps > least)
+        if holes.size:
+            missing += round(float(np.sum(np.round(steps[holes]) - 1)))
+            first = min(first, time[part.rows.start + holes[0]])
     if missing:
-        first = min(
-            time[p.rows.start + int(np.argmax(d > least))] for p, d in holes if np.any(d > least)
-        )
         are = "row is" if missing == 1 else "rows are"
         words.append(f"{missing} {are} missing in the times, the first after {first:.3f} s")
     if len(parts) > 1:
         spans = [f"{time[p.rows.start]:.6g}:{time[p.rows.stop - 1]:.6g}" for p in parts]
-        more = f" and {len(spans) - 5} more" if len(spans) > 5 else ""
         words.append(
-            f"the times pause: the recording is cut into the parts {', '.join(spans[:5])}{more} s."
+            f"the times pause: the recording is cut into the parts {listed(spans, 5)} s."
             " The longest is taken, unless the window lies in another"
         )
     return parts, words
