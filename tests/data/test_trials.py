@@ -14,7 +14,7 @@ from refits import without_intervals
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import TargetError
-from jaxmuscle.data._as_target import as_target, is_recording
+from jaxmuscle.data._as_target import as_target, kind_of_file
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.spectra._bin_law import bin_statistics, mean_error
 
@@ -296,7 +296,7 @@ def test_different_units_are_refused():
 
 BAD = {
     "no segments": ({"segments": None}, "no segments are stated"),
-    "one row": ({"trial_power": [[1.0] * 30]}, r"shape \(1, 30\), and segments names 2 trials"),
+    "one row": ({"trial_power": [[1.0] * 30]}, r"shape \(1, 30\); give .*segments names 2 trials"),
     "negative": ({"trial_power": [[1.0] * 30, [-1.0] * 30]}, "must be finite and larger than 0"),
     "other spectrum": (
         {"trial_power": [[1.0] * 30, [*[1.0] * 29, 2.0]]},
@@ -392,7 +392,7 @@ SNIFFED = {
 def test_a_csv_is_a_recording_or_a_spectrum(case, tmp_path):
     text, recorded = SNIFFED[case]
     (tmp_path / "x.csv").write_text(text)
-    assert is_recording(tmp_path / "x.csv") == recorded
+    assert (kind_of_file(tmp_path / "x.csv") == "recording") == recorded
 
 
 TABS, BLANKS = (SPECTRUM.replace(",", sign) for sign in "\t ")
@@ -416,7 +416,7 @@ def test_a_text_is_a_recording_unless_it_states_a_spectrum(case, suffix, tmp_pat
     text, recorded = SNIFFED_TEXT[case]
     path = tmp_path / f"x{suffix}"
     path.write_text(text)
-    assert is_recording(path) == recorded
+    assert (kind_of_file(path) == "recording") == recorded
     if "spectrum" in case and "misspelt" not in case:
         (tmp_path / "x.csv").write_text(SPECTRUM)
         same, target = as_target(tmp_path / "x.csv"), as_target(path)

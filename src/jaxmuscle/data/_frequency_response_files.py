@@ -16,7 +16,6 @@ from jaxmuscle._common.text import choices, printable
 from ._frequency_response import COLUMNS, FrequencyResponse
 from ._recording_files import read_table
 from ._recording_table import Table
-from ._text_tables import TEXT, beginning
 
 STIFFNESS = {"n/m": 1.0, "n/cm": 1e2, "n/mm": 1e3, "kn/m": 1e3, "mn/mm": 1.0}
 ROTATION = {"nm/rad": 1.0, "nm/deg": 180 / np.pi, "mnm/rad": 1e-3, "mnm/deg": 0.18 / np.pi}
@@ -104,18 +103,6 @@ def load_frequency_response(
         )
     except ValueError as error:
         raise ValueError(f"{table.file}: {_at_its_line(str(error), table)}") from None
-
-
-def is_frequency_response(path: str | os.PathLike[str]) -> bool:
-    """Whether the text at `path` has the columns that `load_frequency_response` reads: frequency,
-    gain and phase, say.
-
-        jm.data.is_frequency_response("response.csv")
-
-    It is read for that.
-    """
-    path = Path(path).expanduser()
-    return path.suffix.lower() in TEXT and path.is_file() and is_response(beginning(path)[1])
 
 
 def is_response(names: Iterable[str]) -> bool:
