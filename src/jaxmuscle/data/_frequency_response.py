@@ -310,7 +310,7 @@ class FrequencyResponse(Shown, eqx.Module):
         notices = (*((unseen,) if self.p_none > UNSEEN else ()), *self.notices)
         known += [("notice", notice) for notice in notices]
         span = f"{f.size} frequencies from {f[0]:.3g} to {f[-1]:.3g} Hz"
-        return facts(f"{self.name}: dynamic stiffness [N/m], {span}", known)
+        return facts(f"{self.name}: dynamic stiffness [N/m], {span}", known, width=9)
 
 
 def check_seen(response: FrequencyResponse, whose: str) -> None:
