@@ -11,7 +11,7 @@ import pytest
 import scipy.io
 
 from jaxmuscle._common.inputs import ALLOWED
-from jaxmuscle.data._as_target import is_recording
+from jaxmuscle.data._as_target import kind_of_file
 from jaxmuscle.data._recording_channels import Channel
 from jaxmuscle.data._recording_choice import signals
 from jaxmuscle.data._recording_files import load_columns, load_recording, read_table
@@ -836,7 +836,7 @@ def test_variables_of_npz(tmp_path):
 def test_texts_by_their_content(name, tmp_path):
     path = write(tmp_path, "time\tForce (N)\n" + rows(TIME, X, sign="\t"), name)
     np.testing.assert_array_equal(load_recording(path).whole, X)
-    assert name == "a.mat" or is_recording(path)
+    assert name == "a.mat" or kind_of_file(path) == "recording"
 
 
 def test_packed_texts(tmp_path, monkeypatch):
@@ -844,7 +844,7 @@ def test_packed_texts(tmp_path, monkeypatch):
     path = write(tmp_path, gzip.compress(text.encode()), "trial.csv.gz")
     recording = load_recording(path, column="Fz")
     np.testing.assert_array_equal(recording.whole, X)
-    assert recording.rate == RATE and is_recording(path)
+    assert recording.rate == RATE and kind_of_file(path) == "recording"
     utf16 = write(tmp_path, gzip.compress(text.encode("utf-16")), "trial.txt.gz")
     np.testing.assert_array_equal(load_recording(utf16, column="Fz", skip_rows=0).whole, X)
     for content, message in (

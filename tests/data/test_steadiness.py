@@ -353,7 +353,7 @@ def test_mistakes_are_named(user_view):
     newtons, share = jm.Recording(x, RATE, name="a"), jm.Recording(x, RATE, name="b", unit="% MVC")
     for wrong, message in (
         ([], "give at least one"),
-        ([newtons, share], r"units differ \(b in % MVC, a in N\); convert them"),
+        ([newtons, share], "units N and % MVC cannot be averaged; bring all trials to one unit"),
         ("trial.csv", r"load_recording\(...\) reads a file"),
         (jm.Recording(x[:300], RATE, name="c"), "c lasts 3 s; give at least 3.84 s"),
         (

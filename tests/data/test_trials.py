@@ -14,7 +14,7 @@ from refits import without_intervals
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import TargetError
-from jaxmuscle.data._as_target import as_target, is_recording
+from jaxmuscle.data._as_target import as_target, kind_of_file
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.spectra._bin_law import bin_statistics, mean_error
 
@@ -296,7 +296,7 @@ def test_different_units_are_refused():
 
 BAD = {
     "no segments": ({"segments": None}, "no segments are stated"),
-    "one row": ({"trial_power": [[1.0] * 30]}, r"shape \(1, 30\), and segments names 2 trials"),
+    "one row": ({"trial_power": [[1.0] * 30]}, r"shape \(1, 30\); give .*segments names 2 trials"),
     "negative": ({"trial_power": [[1.0] * 30, [-1.0] * 30]}, "must be finite and larger than 0"),
     "other spectrum": (
         {"trial_power": [[1.0] * 30, [*[1.0] * 29, 2.0]]},
@@ -392,7 +392,7 @@ SNIFFED = {
 def test_a_csv_is_a_recording_or_a_spectrum(case, tmp_path):
     text, recorded = SNIFFED[case]
     (tmp_path / "x.csv").write_text(text)
-    assert is_recording(tmp_path / "x.csv") == recorded
+    assert (kind_of_file(tmp_path / "x.csv") == "recording") == recorded
 
 
 TABS, BLANKS = (SPECTRUM.replace(",", sign) for sign in "\t ")
@@ -416,7 +416,7 @@ def test_a_text_is_a_recording_unless_it_states_a_spectrum(case, suffix, tmp_pat
     text, recorded = SNIFFED_TEXT[case]
     path = tmp_path / f"x{suffix}"
     path.write_text(text)
-    assert is_recording(path) == recorded
+    assert (kind_of_file(path) == "recording") == recorded
     if "spectrum" in case and "misspelt" not in case:
         (tmp_path / "x.csv").write_text(SPECTRUM)
         same, target = as_target(tmp_path / "x.csv"), as_target(path)
@@ -430,16 +430,6 @@ def test_a_recording_read_as_a_spectrum_says_so(tmp_path):
         TargetError, match=r"columns are time, force; .* Is this a recording\? .*analyse"
     ):
         jm.load_target(path)
-
-
-def test_a_recording_of_an_array():
-    both = np.column_stack([signal(np.random.default_rng(seed)) for seed in (1, 2)])
-    np.testing.assert_array_equal(
-        jm.Recording.from_array(both, RATE, column=1, unit="mN").samples, both[:, 1]
-    )
-    np.testing.assert_array_equal(jm.Recording.from_array(both[:, 0], RATE).samples, both[:, 0])
-    with pytest.raises(ValueError, match="give a number from 0 to 1"):
-        jm.Recording.from_array(both, RATE, column=2)
 
 
 WRONG = {

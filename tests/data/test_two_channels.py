@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 import jaxmuscle as jm
-from jaxmuscle.data._as_target import as_target, is_recording
-from jaxmuscle.data._frequency_response_files import is_frequency_response
+from jaxmuscle.data._as_target import as_target, kind_of_file
 from jaxmuscle.data._recording_files import read_table
 from jaxmuscle.data._two_channels import movement, perturbed_recordings, two_channels
 
@@ -121,7 +120,7 @@ def test_a_frequency_response_is_recognised(tmp_path):
         "frequency_hz,gain_N/mm,phase_deg,coherence\n0.5,1.5,4,0.93\n1,1.5,7,0.95\n",
         encoding="utf-8",
     )
-    assert is_frequency_response(path) and not is_recording(path)
+    assert kind_of_file(path) == "frequency response"
     target = as_target(path, segments=40)
     assert target.stiffness is not None and len(target.proportional_power) == 0
     np.testing.assert_allclose(target.stiffness.gain, [1500, 1500])
@@ -129,7 +128,7 @@ def test_a_frequency_response_is_recognised(tmp_path):
         as_target(path)
     spectrum = tmp_path / "spectrum.csv"
     spectrum.write_text("frequency_hz,power\n0.5,1\n1,2\n", encoding="utf-8")
-    assert not is_frequency_response(spectrum) and not is_frequency_response(tmp_path / "none.csv")
+    assert kind_of_file(spectrum) == kind_of_file(tmp_path / "none.csv") == "spectrum"
 
 
 @pytest.mark.parametrize(

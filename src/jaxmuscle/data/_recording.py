@@ -144,8 +144,8 @@ class Recording(Shown, eqx.Module):
 
         **Arguments:** `frame`, a `pandas.DataFrame`. Its times are a column, or the index: numbers
         in s, a `DatetimeIndex` or a `TimedeltaIndex`. `name` as in `Recording`; the `options` are
-        those of `load_recording` for one column: `column`, `rate`, `units`, `axis`, `reference`, `time`,
-        `max_gap`, `lever_arm`, `outliers`, `quantity`, `baseline`, `detrend`.
+        those of `load_recording` for one column: `column`, `rate`, `units`, `axis`, `reference`,
+        `time`, `max_gap`, `lever_arm`, `outliers`, `quantity`, `baseline`, `detrend`.
 
         **Raises:** `ValueError` naming column, row or argument, and the remedy.
         """

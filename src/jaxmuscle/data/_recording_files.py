@@ -27,7 +27,7 @@ from .dialects._dialects import EXPORTS
 BOOKS = (".xlsx", ".xlsm")
 BINARY = (".mat", ".npy", ".npz", ".c3d", ".edf", ".bdf", ".tdms", ".acq", ".smr")
 KINDS = (*TEXT, ".xlsx", *BINARY, ".xlsm", ".gz")
-TARGETS = (".toml", ".json", ".tar")
+TARGETS = (".toml", ".json")
 ROWS = 90  # that the shortest recording has
 
 

@@ -39,7 +39,7 @@ class Trials(Shown, Sequence[Recording]):
     def __init__(self, recordings: Iterable[Recording]):
         self.recordings = tuple(recordings)
         require(len(self.recordings) > 0, "recordings", [], "give at least one")
-        remedy = "give Recordings, as load_recording returns them"
+        remedy = "give Recordings; load_recording(...) reads a file"
         for other in self.recordings:
             require(isinstance(other, Recording), "recordings", other, remedy)
         units = dict.fromkeys(recording.unit for recording in self.recordings)

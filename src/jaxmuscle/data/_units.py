@@ -11,7 +11,7 @@ from jaxmuscle._common.text import choices
 from jaxmuscle._common.units import NEWTONS
 
 # Each unit | what it measures (nothing: anything) | how else it is written, without blanks, in
-# small letters. A load cell weighs in kg, and every unit may also be written in capitals or as it is.
+# small letters. A load cell weighs in kg. Every unit may also be written in capitals or as it is.
 _TABLE = """\
 N | force | newton newtons
 mN | force | millinewton millinewtons
