@@ -11,7 +11,7 @@ import pytest
 
 from jaxmuscle.data._recording import Recording
 from jaxmuscle.data._recording_files import load_columns, load_recording
-from jaxmuscle.data._recording_labs import read_acq, read_smr
+from jaxmuscle.data._recording_formats import read_acq, read_smr
 from jaxmuscle.data._recording_table import channels_table
 
 X = np.round(10 + np.random.default_rng(0).normal(size=60), 4)

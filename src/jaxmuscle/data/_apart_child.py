@@ -15,8 +15,17 @@ from typing import Any
 import numpy as np
 
 from ._recording_channels import TYPES, Channel, TooLarge, distinct
-from ._recording_formats import read_c3d, read_mat, read_npy, read_npz
-from ._recording_labs import read_acq, read_edf, read_smr, read_tdms, read_xlsx
+from ._recording_formats import (
+    read_acq,
+    read_c3d,
+    read_edf,
+    read_mat,
+    read_npy,
+    read_npz,
+    read_smr,
+    read_tdms,
+    read_xlsx,
+)
 
 LIBRARIES = 2 << 30  # bytes of address space that Python and the libraries take
 COPIES = 2  # of what a file holds that a reader may have at once
