@@ -10,6 +10,7 @@ import pytest
 import scipy.signal
 import scipy.stats
 from entropies import without_entropies
+from recorded import save_columns
 from refits import without_intervals
 
 import jaxmuscle as jm
@@ -316,9 +317,7 @@ def test_bad_trials_are_refused(case):
 
 
 def write(path, x, header="time,force"):
-    t = np.arange(len(x)) / RATE
-    np.savetxt(path, np.column_stack([t, x]), delimiter=",", header=header, comments="", fmt="%.6g")
-    return path
+    return save_columns(path, header, np.arange(len(x)) / RATE, x, fmt="%.6g")
 
 
 def test_files_of_trials(tmp_path):
@@ -328,20 +327,11 @@ def test_files_of_trials(tmp_path):
     assert (
         len(read) == 3 and read.name == "anna" and read[1].name == "anna_1" and len(read[:2]) == 2
     )
-    together = np.column_stack([np.arange(len(read[0].whole)) / RATE, *(r.whole for r in read)])
-    np.savetxt(
-        tmp_path / "all.csv",
-        together,
-        delimiter=",",
-        header="time,one,two,three",
-        comments="",
-        fmt="%.6g",
-    )
-    columns = jm.load_recordings(tmp_path / "all.csv")
-    assert (
-        len(columns) == 3
-        and len(jm.load_recordings(tmp_path / "all.csv", columns=["one", "three"])) == 2
-    )
+    samples = [recording.whole for recording in read]
+    time = np.arange(len(samples[0])) / RATE
+    path = save_columns(tmp_path / "all.csv", "time,one,two,three", time, *samples, fmt="%.6g")
+    columns = jm.load_recordings(path)
+    assert len(columns) == 3 and len(jm.load_recordings(path, columns=["one", "three"])) == 2
     np.testing.assert_allclose(
         columns.target().proportional_power, read.target().proportional_power, rtol=1e-4
     )

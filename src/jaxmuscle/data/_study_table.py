@@ -39,14 +39,18 @@ READING = (*FILES, *SPECTRA, "window")
 OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction")
 
 
-Above0 = Annotated[float, Meta(gt=0)]
+# what a key may hold where it may also be missing
+Text = str | None
+Name = str | int | None
+Above0 = Annotated[float, Meta(gt=0)] | None
+NotBelow0 = Annotated[float, Meta(ge=0)] | None
 
 
 class ReadingTable(Table, kw_only=True):
     """How a recording is read."""
 
     column: Annotated[
-        str | int | None,
+        Name,
         says(
             "Column of the force: its name, or its number from 0. Or NAME of a"
             " [point](../recordings.md#what-is-read), if its coordinates are the columns NAME_x,"
@@ -58,37 +62,35 @@ class ReadingTable(Table, kw_only=True):
         ),
     ] = None
     rate: Annotated[
-        Above0 | None,
+        Above0,
         says("Sampling rate [Hz]", missing="as the file says; an error if it does not"),
     ] = None
     units: Annotated[
-        str | None,
+        Text,
         says(
             "Unit of the column",
             missing="as file or name say; of a point an error",
         ),
     ] = None
     axis: Annotated[
-        str | None,
+        Text,
         says(
             "Of a point: x, y, z, or principal, along which it moves most",
             missing="the column is not a point",
         ),
     ] = None
     reference: Annotated[
-        str | int | None,
+        Name,
         says("Column or point that is subtracted from it", missing="nothing is subtracted"),
     ] = None
     time: Annotated[
-        str | int | None,
+        Name,
         says(
             "Column of the time; none leaves the times out",
             missing="found by its name or unit; or a first column that rises evenly",
         ),
     ] = None
-    max_gap: Annotated[
-        Annotated[float, Meta(ge=0)] | None, says("Longest gap that is closed [s]", missing="0.2")
-    ] = None
+    max_gap: Annotated[NotBelow0, says("Longest gap that is closed [s]", missing="0.2")] = None
     outliers: Annotated[
         Literal["keep", "mask"] | None,
         says(
@@ -97,14 +99,14 @@ class ReadingTable(Table, kw_only=True):
         ),
     ] = None
     lever_arm: Annotated[
-        Above0 | None,
+        Above0,
         says(
             "From the axis to where the force acts [m]: turns a torque into N",
             missing="a torque stays a torque",
         ),
     ] = None
     quantity: Annotated[
-        str | None,
+        Text,
         says("What was measured", missing="follows from the unit, else from the column's name"),
     ] = None
     baseline: Annotated[
@@ -122,21 +124,21 @@ class ReadingTable(Table, kw_only=True):
         Annotated[int, Meta(ge=0)] | None, says("Lines to leave out at the top", missing="0")
     ] = None
     sheet: Annotated[
-        str | int | None,
+        Name,
         says(
             "Sheet of a workbook: its name, or its number from 0",
             missing="the only one with a signal; else an error",
         ),
     ] = None
     spectrum: Annotated[
-        str | None,
+        Text,
         says(
             "standard, slow (resolves what is below 1 Hz), multitaper or pwelch; the same for all",
             missing="standard",
         ),
     ] = None
     mvc: Annotated[
-        Above0 | None,
+        Above0,
         says(
             "Maximal voluntary contraction, in the recording's unit",
             missing="level unknown, if the unit is not % MVC",
@@ -156,15 +158,15 @@ class RecordingTable(ReadingTable, kw_only=True):
     ]
     person: Annotated[str | int, says("Name of the person")]
     group: Annotated[
-        str | int | None,
+        Name,
         says("Group of the person; all recordings have one, or none", missing="no groups"),
     ] = None
     condition: Annotated[
-        str | int | None,
+        Name,
         says("Condition of the recording; all have one, or none", missing="no conditions"),
     ] = None
     trial: Annotated[
-        str | int | None,
+        Name,
         says(
             "Which of several trials in a condition",
             missing="no name; a person may have several trials without one",
@@ -180,7 +182,7 @@ class StudyFile(ReadingTable, kw_only=True):
     """What else a study.toml may say."""
 
     table: Annotated[
-        str | None,
+        Text,
         says(
             "Path of a study.csv, from the folder of the study.toml", missing="needs `recordings`"
         ),
@@ -196,14 +198,14 @@ class StudyFile(ReadingTable, kw_only=True):
         ),
     ] = None
     rung: Annotated[
-        int | str | None,
+        Name,
         says(
             "Model of all people: 0 to 3, or auto",
             missing="3 where everybody has five trials in every condition, else 2",
         ),
     ] = None
     noise: Annotated[
-        str | None,
+        Text,
         says(
             "Colour of the noise: white, band-limited, ornstein-uhlenbeck or pink",
             missing="band-limited",
@@ -220,7 +222,7 @@ class StudyFile(ReadingTable, kw_only=True):
         None
     )
     correction: Annotated[
-        str | None, says("Correction for many comparisons: holm, fdr or none", missing="holm")
+        Text, says("Correction for many comparisons: holm, fdr or none", missing="holm")
     ] = None
 
 
