@@ -122,8 +122,8 @@ def are_recordings(given: Sequence[Any]) -> bool:
 
 
 def kind_of_file(path: str | os.PathLike[str]) -> Kind:
-    """What a file holds: "recording", "spectrum" or "frequency response"; by its ending, a text by
-    its header and rows. What is no file is taken for the name of a spectrum.
+    """What the file at `path` holds: "recording", "spectrum" or "frequency response"; by its ending,
+    a text by its header and rows. What is no file is taken for the name of a spectrum.
 
         jm.data.kind_of_file("trial.csv")
 
