@@ -122,7 +122,7 @@ def are_recordings(given: Sequence[Any]) -> bool:
 
 
 def kind_of_file(path: str | os.PathLike[str]) -> Kind:
-    """What the file at `path` holds: "recording", "spectrum" or "frequency response"; by its ending,
+    """What a `path` leads to, "recording", "spectrum" or "frequency response": by its ending,
     a text by its header and rows. What is no file is taken for the name of a spectrum.
 
         jm.data.kind_of_file("trial.csv")
