@@ -458,7 +458,7 @@ def linear(count: int) -> None:
             fits.append(jm.fit(TASK, record, seeds=0, check_seeds=0))
             seen = fits[-1].target
             right = (
-                jm.Recording.from_array(20.0 + own, rate)
+                jm.Recording(20.0 + own, rate)
                 .steady(record.force.window)
                 .target(settings=seen.settings)
             )

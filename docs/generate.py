@@ -11,7 +11,7 @@ import msgspec
 
 from jaxmuscle.data._frequency_response import ResponseTable
 from jaxmuscle.data._study_table import ReadingTable, RecordingTable, StudyFile
-from jaxmuscle.data._target_files import TargetFile
+from jaxmuscle.data._target_fields import TargetFile
 from jaxmuscle.fits import _fit_file
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS, Parameter
 from jaxmuscle.response._presets import PresetFile

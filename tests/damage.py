@@ -228,32 +228,6 @@ def _same_recording(recording: jm.Recording, text: str) -> bool:
 
 # --- valid files
 
-PROJECT = {
-    "version": [4, 2],
-    "axesColl": [
-        {
-            "name": "XY",
-            "type": "XYAxes",
-            "isLogX": False,
-            "isLogY": False,
-            "noRotation": False,
-            "calibrationPoints": [
-                {"px": 0.0, "py": 400.0, "dx": "0", "dy": "0"},
-                {"px": 600.0, "py": 400.0, "dx": "12", "dy": "0"},
-                {"px": 0.0, "py": 400.0, "dx": "0", "dy": "0"},
-                {"px": 0.0, "py": 0.0, "dx": "0", "dy": "1"},
-            ],
-        }
-    ],
-    "datasetColl": [
-        {
-            "name": "A",
-            "axesName": "XY",
-            "data": [{"x": 19.53 * k, "y": 400 - 390 / (1 + k / 3)} for k in range(1, 31)],
-        }
-    ],
-}
-
 
 def formats(folder: Path, result: jm.fits.FitResult) -> list[Format]:
     """Valid files of every kind; what they name lies in the folder."""
@@ -327,7 +301,6 @@ def formats(folder: Path, result: jm.fits.FitResult) -> list[Format]:
             (TargetError,),
             _same_target,
         ),
-        Format("project.json", json.dumps(PROJECT), jm.load_target, (TargetError,), clean),
         Format("target.csv", spectrum, jm.load_target, (TargetError,), _same_csv),
         Format("study.csv", study, read_study, (ValueError,), _same_study),
         Format("study.toml", tomli_w.dumps(listed), read_study, (ValueError,), clean),

@@ -14,7 +14,6 @@ import signal
 import struct
 import subprocess
 import sys
-import tarfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -119,26 +118,6 @@ def write_xlsx(path: Path) -> None:
     )
 
 
-def write_tar(path: Path) -> None:
-    points = [
-        {"px": 0, "py": 0, "dx": "0", "dy": "0"},
-        {"px": 9, "py": 0, "dx": "12", "dy": "0"},
-        {"px": 0, "py": 0, "dx": "0", "dy": "0"},
-        {"px": 0, "py": 9, "dx": "0", "dy": "1"},
-    ]
-    data = [{"x": x, "y": 9 - x / 2} for x in range(1, 9)]
-    project = {
-        "version": [4, 2],
-        "axesColl": [{"name": "XY", "type": "XYAxes", "calibrationPoints": points}],
-        "datasetColl": [{"name": "one", "axesName": "XY", "data": data}],
-    }
-    text = json.dumps(project).encode()
-    with tarfile.open(path, "w") as archive:
-        entry = tarfile.TarInfo("figure/wpd.json")
-        entry.size = len(text)
-        archive.addfile(entry, io.BytesIO(text))
-
-
 def write_program_mat(path: Path) -> None:
     """What Spike2, LabChart, AcqKnowledge and OTBioLab write, each in its part of the bytes."""
     import scipy.io
@@ -168,7 +147,6 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "edf": write_edf,
     "tdms": write_tdms,
     "xlsx": write_xlsx,
-    "tar": write_tar,
 }
 
 
@@ -254,7 +232,6 @@ def answers(
 def outcome(path: Path, kind: str, code: int, said: bytes) -> str:
     """Read, or the sentence of the error; any other exception than the documented ones goes up."""
     from jaxmuscle.data._apart import _ended, understood
-    from jaxmuscle.data._digitised import read_project
     from jaxmuscle.data._recording_csv import read_csv
     from jaxmuscle.data._recording_files import load_columns
     from jaxmuscle.data._recording_table import channels_table
@@ -266,9 +243,6 @@ def outcome(path: Path, kind: str, code: int, said: bytes) -> str:
             io.BytesIO(said),
             lambda: _ended(code, SECONDS, late=code == -signal.SIGALRM),
         )
-        if kind == ".tar":
-            read_project(found.decode("utf-8", errors="replace"), str(path), None)
-            return ""
         tables = (
             [read_csv(sheet, str(path)) for sheet in found.values()]
             if isinstance(found, dict)

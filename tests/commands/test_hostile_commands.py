@@ -90,10 +90,10 @@ NESTED = {
 }
 # Of every command that reads JSON or TOML, what it reads of it.
 DOCUMENTS = {
-    "fit": (".json", ".toml"),
-    "compare": (".json", ".toml"),
-    "posterior": (".json", ".toml"),
-    "identifiability": (".json", ".toml"),
+    "fit": (".toml",),
+    "compare": (".toml",),
+    "posterior": (".toml",),
+    "identifiability": (".toml",),
     "explore": (".json", ".toml"),
     "simulate": (".json", ".toml"),
     "ensemble": (".json", ".toml"),

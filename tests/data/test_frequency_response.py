@@ -218,17 +218,17 @@ def test_a_target_without_spectrum_needs_a_stiffness(tmp_path):
 HEAD = "frequency_hz,gain,phase_deg,coherence\n"
 FITTED = "frequency_hz,real,imaginary,stderr,fitted_real,fitted_imaginary\n1,100,-20,3,90,1\n"
 DAMAGED = {
-    "fitted, unsorted": (FITTED + "0.5,80,5,2,90,1\n", "line 3: frequency 0.5 Hz does not rise"),
+    "fitted, unsorted": (FITTED + "0.5,80,5,2,90,1\n", "frequency, line 3: 0.5: give rising"),
     "fitted, no error": (FITTED + "2,80,5,0,90,1\n", "stderr, line 3: 0"),
     "fitted, empty": (FITTED + "2,80,,2,90,1\n", "line 3: imaginary is missing or not finite"),
     "word": (HEAD + "1,2,3,0.9\n2,many,3,0.9\n", "line 3: gain 'many' is not a number"),
     "empty cell": (HEAD + "1,2,3,0.9\n2,,3,0.9\n", "line 3: gain is missing or not finite"),
     "short line": (HEAD + "1,2,3,0.9\n2,2,3\n3,2,3,0.9\n", "line 3: 3 of 4 columns found"),
-    "unsorted": ("# a\n" + HEAD + "2,2,3,0.9\n1,2,3,0.9\n", "line 4: frequency 1 Hz does not rise"),
+    "unsorted": ("# a\n" + HEAD + "2,2,3,0.9\n1,2,3,0.9\n", "frequency, line 4: 1: give rising"),
     "coherence above 1": (HEAD + "1,2,3,0.9\n2,2,3,90\n", "coherence, line 3: 90"),
     "coherence of 1": (
         HEAD + "1,2,3,1\n2,2,3,0.9\n",
-        "coherence, line 2: 1: the formula has no error",
+        "of 1 the formula has no error",
     ),
     "gain below 0": (HEAD + "1,2,3,0.9\n2,-2,3,0.9\n", "gain, line 3: -2"),
     "frequency 0": (HEAD + "0,2,3,0.9\n2,2,3,0.9\n", "frequency, line 2: 0"),

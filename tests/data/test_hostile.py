@@ -7,7 +7,6 @@ import random
 import socket
 import subprocess
 import sys
-import tarfile
 import threading
 import zipfile
 
@@ -175,7 +174,7 @@ ANSWERS = {
         ValueError,
         "holds more than",
     ),
-    "a text without end": (b'{"text": 1e3}\n', ValueError, "makes no sense"),
+    "a text without end": (b'{"sheets": [["a", 1e3]]}\n', ValueError, "makes no sense"),
     "cut off": (b'{"channels": [["a", "<f8", 2, null, ""]]}\n' + bytes(9), EOFError, ""),
     "none": (b'{"channels": []}\n', ValueError, "holds no channels with numbers"),
 }
@@ -247,19 +246,12 @@ def packed_mat(path):
     scipy.io.savemat(path, {"force": np.zeros(5_000_000)}, do_compression=True)
 
 
-def declared_tar(path):
-    entry = tarfile.TarInfo("wpd.json")
-    entry.size = 10**12
-    path.write_bytes(entry.tobuf() + bytes(2 * tarfile.BLOCKSIZE))
-
-
 BOMBS = {
     "bomb.npz": (zip_bomb, "it holds more than 0.01 GiB"),
     "bomb.xlsx": (zip_bomb, "it holds more than 0.01 GiB"),
     "bomb.npy": (declared_npy, "it holds more than 0.01 GiB"),
     "bomb.mat": (packed_mat, "it holds more than 0.01 GiB"),
     "bomb73.mat": (declared_hdf5, "it holds more than 0.01 GiB"),
-    "bomb.tar": (declared_tar, "it holds more than 0.01 GiB"),
 }
 
 
@@ -274,7 +266,7 @@ def test_bombs(name, tmp_path, monkeypatch):
     make(path)
     monkeypatch.setenv(ALLOWED, "0.01")
     with pytest.raises(ValueError) as caught:
-        jm.load_target(path) if path.suffix == ".tar" else read_table(path)
+        read_table(path)
     assert message in one_sentence(path, caught.value) and ALLOWED in str(caught.value)
 
 
@@ -365,8 +357,6 @@ READERS = {
     "trial.mat": load_recording,
     "trial.c3d": load_recording,
     "target.toml": jm.load_target,
-    "target.json": jm.load_target,
-    "target.tar": jm.load_target,
     "spectrum.csv": jm.load_target,
     "preset.toml": jm.load_preset,
     "fit.json": jm.load_result,

@@ -199,13 +199,22 @@ def test_a_measure_may_be_given_and_prints_itself():
 
 GOOD = {"value": 1.0, "stderr": 0.1, "low": 0.8, "high": 1.2, "unit": "N", "error_from": "trials"}
 DAMAGED = {
-    "a number": (3, "measured: 3 needs a table with the keys value, stderr"),
-    "a list": ([1.0], r"measured: \[1.0\] needs a table"),
-    "a number for a quantity": ({"mean": 1.0}, "measured: 'mean' needs a table with the keys"),
-    "an unknown key": ({"mean": GOOD | {"values": 1.0}}, "measured: 'mean' needs a table"),
-    "no unit": ({"mean": {"value": 1.0, "error_from": "trials"}}, "measured: 'mean' needs a table"),
-    "a text": ({"mean": GOOD | {"stderr": "big"}}, "measured.mean: stderr 'big' is not a number"),
-    "yes": ({"mean": GOOD | {"value": True}}, "measured.mean: value True is not a number"),
+    "a number": (3, "measured 3: give a table for each quantity, by its name"),
+    "a list": ([1.0], r"measured \[1.0\]: give a table for each quantity"),
+    "a number for a quantity": ({"mean": 1.0}, "measured.mean: needs a table with the keys"),
+    "an unknown key": ({"mean": GOOD | {"values": 1.0}}, "did you mean 'value'?"),
+    "no unit": (
+        {"mean": {"value": 1.0, "error_from": "trials"}},
+        "measured.mean: the key 'unit' is missing",
+    ),
+    "a text": (
+        {"mean": GOOD | {"stderr": "big"}},
+        "measured.mean: stderr must be a number or nothing, not a text",
+    ),
+    "yes": (
+        {"mean": GOOD | {"value": True}},
+        "measured.mean: value must be a number or nothing, not true",
+    ),
     "a unit that is none": ({"mean": GOOD | {"unit": 3}}, "measured.mean: unit"),
     "no number": (
         {"mean": GOOD | {"value": math.nan}},

@@ -1,6 +1,7 @@
 """Files as laboratories save them: headers of many kinds, binary formats, tables, several columns,
 memory."""
 
+import functools
 import sys
 import tracemalloc
 import types
@@ -8,10 +9,12 @@ import types
 import numpy as np
 import pandas
 import pytest
+import recorded
+from recorded import assert_reads, refused, write
 
 from jaxmuscle.data._recording import Recording
 from jaxmuscle.data._recording_files import load_columns, load_recording
-from jaxmuscle.data._recording_labs import read_acq, read_smr
+from jaxmuscle.data._recording_formats import read_acq, read_smr
 from jaxmuscle.data._recording_table import channels_table
 
 X = np.round(10 + np.random.default_rng(0).normal(size=60), 4)
@@ -20,12 +23,7 @@ RATE = 500
 TIME = np.arange(X.size) / RATE
 
 
-def rows(*columns, sign="\t", comma=False):
-    cells = [
-        [str(x).replace(".", ",") if comma else str(x) for x in row]
-        for row in zip(*columns, strict=True)
-    ]
-    return "".join(sign.join(row) + "\n" for row in cells)
+rows = functools.partial(recorded.rows, sign="\t")
 
 
 def clock_times(form, offset=0):
@@ -104,88 +102,69 @@ DIADEM = """#BEGINGLOBALHEADER
 210,EXPLICIT
 #ENDCHANNELHEADER
 """
-HEADERS = {  # content, what column is asked for, the unit found
-    "LabChart": (LABCHART + VALUES + rows(TIME, X, EMG), "Force", "N"),
-    "LabChart, units of the range": (LABCHART + rows(TIME, X, EMG), "Force", "N"),
-    "LabChart without times": (LABCHART + VALUES + rows(X, EMG), "Force", "N"),
-    "LabChart, one channel": (
-        "Interval=\t2 ms\nChannelTitle=\tForce\nRange=\t100 N\n" + rows(X),
-        None,
-        "N",
-    ),
+HEADERS = {  # content; what column is asked for, unless None; the unit found, unless N
+    "LabChart": (LABCHART + VALUES + rows(TIME, X, EMG), "Force"),
+    "LabChart, units of the range": (LABCHART + rows(TIME, X, EMG), "Force"),
+    "LabChart without times": (LABCHART + VALUES + rows(X, EMG), "Force"),
+    "LabChart, one channel": ("Interval=\t2 ms\nChannelTitle=\tForce\nRange=\t100 N\n" + rows(X),),
     "LabChart with comments": (
         LABCHART + rows(TIME, X, EMG).replace("\n", "\t#* start\n", 1),
         "Force",
-        "N",
     ),
     "LabChart, decimal commas": (
         LABCHART.replace("0.002", "0,002") + rows(TIME, X, EMG, comma=True),
         "Force",
-        "N",
     ),
-    "Spike2": (SPIKE2.format(rows(X), rows(EMG)), "force", "N"),
-    "Spike2, spreadsheet": ('"Time","1 Force"\n' + rows(TIME, X, sign=","), None, "N"),
-    "AcqKnowledge": (
-        BIOPAC + "CH1\tCH2\t\n60\t60\t\n" + rows(X, EMG, [""] * 60),
-        "Force - DA100C",
-        "N",
-    ),
-    "AcqKnowledge with times": (BIOPAC + "sec\tCH1\tCH2\n\t60\t60\n" + rows(TIME, X, EMG), 1, "N"),
-    "AcqKnowledge in ms": (
-        BIOPAC + "milliSec\tCH1\tCH2\n" + rows(np.arange(60) * 2.0, X, EMG),
-        1,
-        "N",
-    ),
-    "AcqKnowledge, commas": (
-        BIOPAC + "sec,CH1,CH2\n,60,60\n" + rows(TIME, X, EMG, sign=","),
-        1,
-        "N",
-    ),
-    "DIAdem": (DIADEM + rows(X, EMG, comma=True), "Kraft", "N"),
-    "DIAdem, csv": ("Zeit;Kraft\ns;N\n" + rows(TIME, X, sign=";", comma=True), "Kraft", "N"),
-    "row of units": ("time,force,length\ns,N,mm\n" + rows(TIME, X, EMG, sign=","), "force", "N"),
-    "row of units in ms": ("time\tforce\n[ms]\t[N]\n" + rows(np.arange(60) * 2, X), None, "N"),
-    "empty column": ("X_Value\tForce\tComment\n" + rows(TIME, X, [""] * 60), None, "N"),
+    "Spike2": (SPIKE2.format(rows(X), rows(EMG)), "force"),
+    "Spike2, spreadsheet": ('"Time","1 Force"\n' + rows(TIME, X, sign=","), None, "a.u."),
+    "AcqKnowledge": (BIOPAC + "CH1\tCH2\t\n60\t60\t\n" + rows(X, EMG, [""] * 60), "Force - DA100C"),
+    "AcqKnowledge with times": (BIOPAC + "sec\tCH1\tCH2\n\t60\t60\n" + rows(TIME, X, EMG), 1),
+    "AcqKnowledge in ms": (BIOPAC + "milliSec\tCH1\tCH2\n" + rows(np.arange(60) * 2.0, X, EMG), 1),
+    "AcqKnowledge, commas": (BIOPAC + "sec,CH1,CH2\n,60,60\n" + rows(TIME, X, EMG, sign=","), 1),
+    "DIAdem": (DIADEM + rows(X, EMG, comma=True), "Kraft"),
+    "DIAdem, csv": ("Zeit;Kraft\ns;N\n" + rows(TIME, X, sign=";", comma=True), "Kraft"),
+    "row of units": ("time,force,length\ns,N,mm\n" + rows(TIME, X, EMG, sign=","), "force"),
+    "row of units in ms": ("time\tforce\n[ms]\t[N]\n" + rows(np.arange(60) * 2, X),),
+    "empty column": ("X_Value\tForce\tComment\n" + rows(TIME, X, [""] * 60), None, "a.u."),
     "all quoted": (
         '"time","force"\n' + rows(*([f'"{x}"' for x in column] for column in (TIME, X)), sign=","),
         None,
-        "N",
+        "a.u.",
     ),
-    "for Excel": ("sep=;\nZeit;Kraft\n" + rows(TIME, X, sign=";"), None, "N"),
+    "for Excel": ("sep=;\nZeit;Kraft\n" + rows(TIME, X, sign=";"), None, "a.u."),
     "words above": (
         "Subject 3, left\nknee, 60 deg\n\ntime,force\n" + rows(TIME, X, sign=","),
         None,
-        "N",
+        "a.u.",
     ),
-    "Zeit [s]": ("Zeit [s];Kraft [N]\n" + rows(TIME, X, sign=";", comma=True), "kraft", "N"),
-    "temps (ms)": ("temps (ms)\tforce (N)\n" + rows(np.arange(60) * 2, X), None, "N"),
-    "only a unit": ("[s]\tForce / N\n" + rows(TIME, X), "force", "N"),
-    "unknown language": (
-        "hora (ms),fuerza (N)\n" + rows(np.arange(60) * 2, X, sign=","),
-        None,
-        "N",
+    "Zeit [s]": ("Zeit [s];Kraft [N]\n" + rows(TIME, X, sign=";", comma=True), "kraft"),
+    "temps (ms)": ("temps (ms)\tforce (N)\n" + rows(np.arange(60) * 2, X),),
+    "only a unit": ("[s]\tForce / N\n" + rows(TIME, X), "force"),
+    "unknown language": ("hora (ms),fuerza (N)\n" + rows(np.arange(60) * 2, X, sign=","),),
+    "Windows-1252": (
+        ("Zeit [s];Stärke [N]\n" + rows(TIME, X, sign=";")).encode("cp1252"),
+        "Stärke",
     ),
-    "Windows-1252": ("Zeit [s];Stärke [N]\n" + rows(TIME, X, sign=";"), "Stärke", "N"),
     "ISO times": (
         "when,force\n" + rows(clock_times("%Y-%m-%dT%H:%M:%S.%f"), X, sign=","),
         None,
-        "N",
+        "a.u.",
     ),
-    "ISO times with a zone": ("when,f_N\n" + rows(ZONED, X, sign=","), None, "N"),
+    "ISO times with a zone": ("when,f_N\n" + rows(ZONED, X, sign=","),),
     "date and time": (
         "Zeit;F\n" + rows(clock_times("%d.%m.%Y %H:%M:%S.%f"), X, sign=";"),
         None,
-        "N",
+        "a.u.",
     ),
-    "time of day": ("clock\tforce\n" + rows(clock_times("%H:%M:%S.%f"), X), None, "N"),
+    "time of day": ("clock\tforce\n" + rows(clock_times("%H:%M:%S.%f"), X), None, "a.u."),
     "past midnight": (
         "clock\tforce\n" + rows(clock_times("%H:%M:%S.%f", 14 * 3_600_000 - 50), X),
         None,
-        "N",
+        "a.u.",
     ),
-    "rising evenly": ("a,b\n" + rows(TIME, X, sign=","), "b", "N"),
-    "rising evenly, no header": (rows(TIME, X), None, "N"),
-    "force_N": ("time_s,force_N\n" + rows(TIME, X, sign=","), "force", "N"),
+    "rising evenly": ("a,b\n" + rows(TIME, X, sign=","), "b", "a.u."),
+    "rising evenly, no header": (rows(TIME, X), None, "a.u."),
+    "force_N": ("time_s,force_N\n" + rows(TIME, X, sign=","), "force"),
     "force_pctMVC": ("time_s,force_pctMVC\n" + rows(TIME, X, sign=","), "force", "% MVC"),
     "torque_Nm": ("t_ms,torque_Nm\n" + rows(np.arange(60) * 2, X, sign=","), "torque", "N m"),
     "load cell": ("time_s,force_kg\n" + rows(TIME, X, sign=","), "force", "kgf"),
@@ -193,36 +172,14 @@ HEADERS = {  # content, what column is asked for, the unit found
     "position_mm": ("time,position_mm,note\n" + rows(TIME, X, ["rest"] * 60, sign=","), None, "mm"),
 }
 
-# Nothing in them says that it is in N.
-UNSTATED = (
-    "Spike2, spreadsheet",
-    "empty column",
-    "all quoted",
-    "for Excel",
-    "words above",
-    "ISO times",
-    "date and time",
-    "time of day",
-    "past midnight",
-    "rising evenly",
-    "rising evenly, no header",
-)
-
-
-def write(folder, content, name="trial.txt"):
-    path = folder / name
-    encoding = "cp1252" if isinstance(content, str) and "ä" in content else "utf-8"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode(encoding))
-    return path
-
 
 @pytest.mark.parametrize("case", HEADERS)
 def test_headers(case, tmp_path):
-    content, column, unit = HEADERS[case]
+    content, column, unit = (*HEADERS[case], *(None, "N")[len(HEADERS[case]) - 1 :])
     recording = load_recording(write(tmp_path, content), column=column)
     np.testing.assert_array_equal(recording.whole, X)
     assert recording.rate == pytest.approx(RATE, rel=1e-9)
-    assert recording.unit == ("a.u." if case in UNSTATED else unit) and recording.start == 0
+    assert recording.unit == unit and recording.start == 0
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -338,9 +295,8 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_refused(case, tmp_path):
     content, arguments, message = BAD[case]
-    with pytest.raises(ValueError) as caught:
+    with refused(message):
         load_recording(write(tmp_path, content), **arguments)
-    assert message in str(caught.value)
 
 
 def test_time_and_skipped_rows(tmp_path):
@@ -387,14 +343,14 @@ def test_all_columns(tmp_path):
         RATE,
         "N",
     )
-    assert [r.name for r in load_columns(tmp_path / "trial.txt", ["two"])] == ["trial two_N"]
+    assert [r.name for r in load_columns(tmp_path / "trial.csv", ["two"])] == ["trial two_N"]
     np.savez(tmp_path / "trials.npz", Data=np.stack([X, EMG, X + EMG], axis=1), fs=200)
     assert [r.name for r in load_columns(tmp_path / "trials.npz")] == [
         f"trials Data:{i}" for i in range(3)
     ]
     assert {r.rate for r in load_columns(tmp_path / "trials.npz")} == {200}
     with pytest.raises(ValueError, match="give the names of the columns that are recordings"):
-        load_columns(tmp_path / "trial.txt", [])
+        load_columns(tmp_path / "trial.csv", [])
 
 
 INDEXES = {
@@ -420,8 +376,7 @@ def test_table_with_its_times_in_the_index(index):
 def test_table_with_its_times_in_a_column():
     frame = pandas.DataFrame({"when": INDEXES["datetimes"], "force (N)": X, "length_mm": EMG})
     recording = Recording.from_dataframe(frame, column="force")
-    np.testing.assert_array_equal(recording.whole, X)
-    assert (recording.rate, recording.unit) == (RATE, "N")
+    assert_reads(recording, X, RATE, "N")
     assert Recording.from_dataframe(frame[["length_mm"]], rate=100).unit == "mm"
     assert Recording.from_dataframe(frame, column="length_mm", reference="force").unit == "mm"
 
@@ -445,9 +400,8 @@ def test_table_with_its_times_in_a_column():
     ],
 )
 def test_bad_tables(frame, message):
-    with pytest.raises(ValueError) as caught:
+    with refused(message):
         Recording.from_dataframe(frame)
-    assert message in str(caught.value)
 
 
 def test_xlsx(tmp_path):
@@ -455,8 +409,7 @@ def test_xlsx(tmp_path):
     frame = pandas.DataFrame({"Zeit": ["s", *TIME], "Kraft": ["N", *X]})
     frame.to_excel(tmp_path / "trial.xlsx", index=False, startrow=2)
     recording = load_recording(tmp_path / "trial.xlsx")
-    np.testing.assert_array_equal(recording.whole, X)
-    assert (recording.rate, recording.unit) == (RATE, "N")
+    assert_reads(recording, X, RATE, "N")
     pandas.DataFrame({"when": INDEXES["datetimes"], "force": X}).to_excel(
         tmp_path / "dated.xlsx", index=False
     )
@@ -510,8 +463,7 @@ def test_tdms(tmp_path):
             ]
         )
     recording = load_recording(path, column="arm/Force")
-    np.testing.assert_array_equal(recording.whole, X)
-    assert (recording.rate, recording.unit) == (RATE, "N")
+    assert_reads(recording, X, RATE, "N")
     assert [r.name for r in load_columns(path)] == ["trial arm/Force", "trial leg/Force"]
 
 
@@ -521,8 +473,7 @@ def test_acq(monkeypatch):
     fake = types.SimpleNamespace(read_file=lambda path: types.SimpleNamespace(channels=[channel]))
     monkeypatch.setitem(sys.modules, "bioread", fake)
     recording = load_recording(channels_table("trial.acq", read_acq("trial.acq", 0)))
-    np.testing.assert_array_equal(recording.whole, X)
-    assert (recording.rate, recording.unit) == (500, "V")
+    assert_reads(recording, X, 500, "V")
 
 
 def test_smr(monkeypatch):
@@ -543,8 +494,7 @@ def test_smr(monkeypatch):
     recording = load_recording(
         channels_table("trial.smr", read_smr("trial.smr", 0)), column="Force"
     )
-    np.testing.assert_array_equal(recording.whole, X)
-    assert (recording.rate, recording.unit) == (500, "N")
+    assert_reads(recording, X, 500, "N")
     blocks.segments.append(segment)
     with pytest.raises(ValueError, match="holds 2 stretches with gaps between"):
         read_smr("trial.smr", 0)

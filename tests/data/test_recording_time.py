@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pandas
 import pytest
+from recorded import noticed, save_columns
 from typer.testing import CliRunner
 
 from jaxmuscle.commands.main import app
@@ -32,20 +33,8 @@ EVEN = Recording(force(T), 100).steady()
 CV = EVEN.summary().coefficient_of_variation
 
 
-def write(
-    folder,
-    time,
-    x=None,
-    header="time_s,force_N",
-    name="trial.csv",
-    digits: str | list[str] = "%.10g",
-):
-    x = force(time) if x is None else x
-    head = {"header": header} if header else {}
-    np.savetxt(
-        folder / name, np.stack([time, x], axis=1), fmt=digits, delimiter=",", comments="", **head
-    )
-    return folder / name
+def write(folder, time, x=None, header="time_s,force_N", name="trial.csv", digits="%.10g"):
+    return save_columns(folder / name, header, time, force(time) if x is None else x, fmt=digits)
 
 
 def kept(*lost):
@@ -144,7 +133,7 @@ def test_missing_rows_are_gaps(case, scale, tmp_path):
     np.testing.assert_allclose(recording.whole[there], force(T[there]), rtol=1e-8, atol=1e-9)
     lost = int(np.sum(~there))
     assert any(n.startswith(f"{lost} row") and "missing in" in n for n in recording.notices)
-    assert any(f"({lost} samples, longest" in n for n in recording.notices)
+    assert noticed(recording, f"({lost} samples, longest")
     assert case == "a third of all" or is_the_even_one(recording, 0.02)
 
 
@@ -156,7 +145,7 @@ def test_lost_rows_of_a_rate_that_is_no_decimal(tmp_path):
         write(tmp_path, np.round(1000 * t[there]), force(t[there]), "millis,force_N")
     )
     assert recording.whole.size == 1400 and recording.rate == pytest.approx(60, rel=1e-4)
-    assert any(n.startswith("5 rows are missing") for n in recording.notices)
+    assert noticed(recording, "5 rows are missing")
 
 
 def test_rows_of_coarse_times_may_be_missing(tmp_path):
@@ -167,7 +156,7 @@ def test_rows_of_coarse_times_may_be_missing(tmp_path):
     assert not any("missing" in n or "at a time" in n for n in whole.notices)
     recording = load_recording(write(tmp_path, t[there].round(3), np.sin(t[there])))
     assert recording.rate == 2048 and recording.whole.size == 12_000
-    assert any(n.startswith("100 rows are missing") for n in recording.notices)
+    assert noticed(recording, "100 rows are missing")
 
 
 def paused(at=1500, pause=7.3333):
@@ -237,7 +226,7 @@ def test_units_of_time_are_recognised_by_their_size(case, name, rate, tmp_path):
     )
     assert recording.rate == pytest.approx(100, rel=5e-3)
     assert is_the_even_one(recording)
-    assert any(f"is taken as {unit}" in n for n in recording.notices) == (unit != "s")
+    assert noticed(recording, f"is taken as {unit}") == (unit != "s")
 
 
 def test_names_that_hold_the_unit(tmp_path):
@@ -285,7 +274,7 @@ def test_a_column_of_time_that_counts_the_rows(tmp_path):
 
 def test_a_nameless_first_column_of_uneven_times(tmp_path):
     recording = load_recording(write(tmp_path, stepping(0.2), header=""))
-    assert any("column 0 rises" in n for n in recording.notices) and is_the_even_one(recording)
+    assert noticed(recording, "column 0 rises") and is_the_even_one(recording)
     recording = load_recording(write(tmp_path, T[kept(700)], header=""))
     assert recording.whole.size == N
 
@@ -344,7 +333,7 @@ def test_tables_in_memory_follow_the_same_rules():
     assert read(1e12 + 1e12 + 10 * ROWS).rate == 100
     assert read(paused()).whole.size == 1500
     stamps = np.datetime64("2026-11-22T10:00", "ns") + (1e9 * stepping(0.2)).astype("m8[ns]")
-    assert any("uneven" in n for n in read(pandas.DatetimeIndex(stamps)).notices)
+    assert noticed(read(pandas.DatetimeIndex(stamps)), "uneven")
     with pytest.raises(ValueError, match=r"the table, row 1200: .* runs backwards"):
         read(np.where(ROWS < 1200, T, T - 1))
     assert read(np.where(ROWS < 1200, T, T - 1), time="none", rate=100).whole.size == N

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from recorded import noticed, save_columns
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
@@ -109,7 +110,7 @@ NOTHING = {
 @pytest.mark.parametrize("case", NOTHING)
 def test_a_rest_that_is_zero_says_nothing(case):
     found = jm.Recording(NOTHING[case], RATE)
-    assert not any("rest" in notice for notice in found.notices)
+    assert not noticed(found, "rest")
     np.testing.assert_array_equal(found.whole, NOTHING[case])
 
 
@@ -134,27 +135,7 @@ def test_the_steady_part_is_found_although_the_rest_is_kept():
 
 
 def write(folder, x, name="force_N", file="trial.csv"):
-    path = folder / file
-    np.savetxt(
-        path, np.stack([T[: len(x)], x], 1), delimiter=",", header=f"time_s,{name}", comments=""
-    )
-    return path
-
-
-def test_every_way_to_read_takes_a_baseline(tmp_path):
-    import pandas
-
-    path = write(tmp_path, HELD + LIMB)
-    frame = pandas.read_csv(path)
-    found = [
-        jm.load_recording(path, baseline="0:1"),
-        jm.load_recordings([path], baseline=(0, 1))[0],
-        jm.Recording.from_dataframe(frame, baseline=(0.0, 1.0)),
-        jm.Recording.from_array(HELD + LIMB, RATE, baseline=(0, 1)),
-    ]
-    for one in found:
-        np.testing.assert_allclose(one.whole, found[-1].whole, atol=1e-9)
-        assert abs(np.mean(one.whole[:100])) < 1e-9
+    return save_columns(folder / file, f"time_s,{name}", T[: len(x)], x, fmt="%.18e")
 
 
 def test_commands_and_mvc(tmp_path):
@@ -185,7 +166,7 @@ def test_the_force_of_a_moved_record_counts_from_rest():
     moved = 1e-3 * np.random.default_rng(11).normal(size=T.size) * (SHAPE == 1)
     found = jm.PerturbedRecording.from_array(HELD - 60, moved, RATE, positive="lengthening")
     assert np.mean(found.steady((4, 20)).force.samples) == pytest.approx(LEVEL, rel=5e-3)
-    assert not any("mean force is negative" in notice for notice in found.notices)
+    assert not noticed(found, "mean force is negative")
     kept = jm.PerturbedRecording.from_array(
         HELD + 20, moved, RATE, positive="lengthening", baseline="none"
     )
@@ -206,7 +187,7 @@ def test_a_study_has_the_columns(tmp_path):
     first, second = (cell.target for cell in cells_of_study(read_study(table).rows, {}))
     assert first.mean is not None and second.mean is not None
     assert second.mean[0] - first.mean[0] == pytest.approx(5, rel=0.05)
-    assert any("straight line" in notice for notice in first.notices)
+    assert noticed(first, "straight line")
     table.write_text("file,person,detrend\na.csv,anna,perhaps\nb.csv,bert,\n")
     with pytest.raises(ValueError, match="line 2: detrend='perhaps': write true or false"):
         read_study(table)

@@ -10,11 +10,12 @@ import pytest
 import scipy.signal
 import scipy.stats
 from entropies import without_entropies
+from recorded import save_columns
 from refits import without_intervals
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import TargetError
-from jaxmuscle.data._as_target import as_target, is_recording
+from jaxmuscle.data._as_target import as_target, kind_of_file
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.spectra._bin_law import bin_statistics, mean_error
 
@@ -296,7 +297,7 @@ def test_different_units_are_refused():
 
 BAD = {
     "no segments": ({"segments": None}, "no segments are stated"),
-    "one row": ({"trial_power": [[1.0] * 30]}, r"shape \(1, 30\), and segments names 2 trials"),
+    "one row": ({"trial_power": [[1.0] * 30]}, r"shape \(1, 30\); give .*segments names 2 trials"),
     "negative": ({"trial_power": [[1.0] * 30, [-1.0] * 30]}, "must be finite and larger than 0"),
     "other spectrum": (
         {"trial_power": [[1.0] * 30, [*[1.0] * 29, 2.0]]},
@@ -316,9 +317,7 @@ def test_bad_trials_are_refused(case):
 
 
 def write(path, x, header="time,force"):
-    t = np.arange(len(x)) / RATE
-    np.savetxt(path, np.column_stack([t, x]), delimiter=",", header=header, comments="", fmt="%.6g")
-    return path
+    return save_columns(path, header, np.arange(len(x)) / RATE, x, fmt="%.6g")
 
 
 def test_files_of_trials(tmp_path):
@@ -328,20 +327,11 @@ def test_files_of_trials(tmp_path):
     assert (
         len(read) == 3 and read.name == "anna" and read[1].name == "anna_1" and len(read[:2]) == 2
     )
-    together = np.column_stack([np.arange(len(read[0].whole)) / RATE, *(r.whole for r in read)])
-    np.savetxt(
-        tmp_path / "all.csv",
-        together,
-        delimiter=",",
-        header="time,one,two,three",
-        comments="",
-        fmt="%.6g",
-    )
-    columns = jm.load_recordings(tmp_path / "all.csv")
-    assert (
-        len(columns) == 3
-        and len(jm.load_recordings(tmp_path / "all.csv", columns=["one", "three"])) == 2
-    )
+    samples = [recording.whole for recording in read]
+    time = np.arange(len(samples[0])) / RATE
+    path = save_columns(tmp_path / "all.csv", "time,one,two,three", time, *samples, fmt="%.6g")
+    columns = jm.load_recordings(path)
+    assert len(columns) == 3 and len(jm.load_recordings(path, columns=["one", "three"])) == 2
     np.testing.assert_allclose(
         columns.target().proportional_power, read.target().proportional_power, rtol=1e-4
     )
@@ -392,7 +382,7 @@ SNIFFED = {
 def test_a_csv_is_a_recording_or_a_spectrum(case, tmp_path):
     text, recorded = SNIFFED[case]
     (tmp_path / "x.csv").write_text(text)
-    assert is_recording(tmp_path / "x.csv") == recorded
+    assert (kind_of_file(tmp_path / "x.csv") == "recording") == recorded
 
 
 TABS, BLANKS = (SPECTRUM.replace(",", sign) for sign in "\t ")
@@ -416,7 +406,7 @@ def test_a_text_is_a_recording_unless_it_states_a_spectrum(case, suffix, tmp_pat
     text, recorded = SNIFFED_TEXT[case]
     path = tmp_path / f"x{suffix}"
     path.write_text(text)
-    assert is_recording(path) == recorded
+    assert (kind_of_file(path) == "recording") == recorded
     if "spectrum" in case and "misspelt" not in case:
         (tmp_path / "x.csv").write_text(SPECTRUM)
         same, target = as_target(tmp_path / "x.csv"), as_target(path)
@@ -430,16 +420,6 @@ def test_a_recording_read_as_a_spectrum_says_so(tmp_path):
         TargetError, match=r"columns are time, force; .* Is this a recording\? .*analyse"
     ):
         jm.load_target(path)
-
-
-def test_a_recording_of_an_array():
-    both = np.column_stack([signal(np.random.default_rng(seed)) for seed in (1, 2)])
-    np.testing.assert_array_equal(
-        jm.Recording.from_array(both, RATE, column=1, unit="mN").samples, both[:, 1]
-    )
-    np.testing.assert_array_equal(jm.Recording.from_array(both[:, 0], RATE).samples, both[:, 0])
-    with pytest.raises(ValueError, match="give a number from 0 to 1"):
-        jm.Recording.from_array(both, RATE, column=2)
 
 
 WRONG = {

@@ -3,10 +3,10 @@ theirs."""
 
 import numpy as np
 import pytest
+from recorded import save_columns
 
 import jaxmuscle as jm
-from jaxmuscle.data._as_target import as_target, is_recording
-from jaxmuscle.data._frequency_response_files import is_frequency_response
+from jaxmuscle.data._as_target import as_target, kind_of_file
 from jaxmuscle.data._recording_files import read_table
 from jaxmuscle.data._two_channels import movement, perturbed_recordings, two_channels
 
@@ -21,16 +21,7 @@ def written(folder, *names, name="x.csv"):
         np.arange(ROWS) / 100,
         *(FORCE if n.casefold().startswith(("f", "t", "k", "b")) else MOVED for n in names),
     ]
-    head = ",".join(("time_s", *names))
-    np.savetxt(
-        folder / name,
-        np.stack(columns, axis=1),
-        delimiter=",",
-        header=head,
-        comments="",
-        fmt="%.6g",
-    )
-    return folder / name
+    return save_columns(folder / name, ",".join(("time_s", *names)), *columns, fmt="%.6g")
 
 
 @pytest.mark.parametrize(
@@ -121,7 +112,7 @@ def test_a_frequency_response_is_recognised(tmp_path):
         "frequency_hz,gain_N/mm,phase_deg,coherence\n0.5,1.5,4,0.93\n1,1.5,7,0.95\n",
         encoding="utf-8",
     )
-    assert is_frequency_response(path) and not is_recording(path)
+    assert kind_of_file(path) == "frequency response"
     target = as_target(path, segments=40)
     assert target.stiffness is not None and len(target.proportional_power) == 0
     np.testing.assert_allclose(target.stiffness.gain, [1500, 1500])
@@ -129,7 +120,7 @@ def test_a_frequency_response_is_recognised(tmp_path):
         as_target(path)
     spectrum = tmp_path / "spectrum.csv"
     spectrum.write_text("frequency_hz,power\n0.5,1\n1,2\n", encoding="utf-8")
-    assert not is_frequency_response(spectrum) and not is_frequency_response(tmp_path / "none.csv")
+    assert kind_of_file(spectrum) == kind_of_file(tmp_path / "none.csv") == "spectrum"
 
 
 @pytest.mark.parametrize(
@@ -150,21 +141,10 @@ def test_how_much_the_insertion_moves(tmp_path, column, factor, size, unit, rest
     count."""
     moved = 7.0 + factor * MOVED
     moved[: ROWS // 5], moved[-ROWS // 5 :], moved[ROWS // 2] = -20.0, 50.0, np.nan
-    table = np.stack([np.arange(ROWS) / 100, FORCE, moved], axis=1)
-    np.savetxt(
-        tmp_path / "x.csv",
-        table,
-        delimiter=",",
-        header=f"time_s,force_N,{column}",
-        comments="",
-        fmt="%.9g",
-    )
-    found = movement(tmp_path / "x.csv", column)
-    assert found.size == pytest.approx(size, rel=0.02, abs=1e-12) and (found.unit, found.rests) == (
-        unit,
-        rests,
-    )
-    alone = (
-        perturbed_recordings(tmp_path / "x.csv", files=True, held=True) if unit and rests else ()
-    )
-    assert alone == ()
+    header = f"time_s,force_N,{column}"
+    path = save_columns(tmp_path / "x.csv", header, np.arange(ROWS) / 100, FORCE, moved)
+    found = movement(path, column)
+    assert found.size == pytest.approx(size, rel=0.02, abs=1e-12)
+    assert (found.unit, found.rests) == (unit, rests)
+    if unit and rests:
+        assert perturbed_recordings(path, files=True, held=True) == ()

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from recorded import noticed, save_columns
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
@@ -14,11 +15,8 @@ RATE = 100
 X = 40 + np.random.default_rng(0).normal(size=600)
 
 
-def write(folder, name, x=X, rate=RATE, sign=","):
-    path = folder / "trial.csv"
-    rows = "".join(f"{i / rate:.4f}{sign}{value:.6f}\n" for i, value in enumerate(x))
-    path.write_text(f"time_s{sign}{name}\n" + rows)
-    return path
+def write(folder, name, x=X):
+    return save_columns(folder / "trial.csv", f"time_s,{name}", np.arange(len(x)) / RATE, x)
 
 
 NAMES = {  # name of a column: what is left of it, its unit, what that measures
@@ -137,7 +135,7 @@ def test_a_force_without_a_unit_has_no_newtons(name, tmp_path):
     force without a unit counts as one."""
     found = jm.load_recording(write(tmp_path, name))
     assert (found.unit, found.quantity) == ("a.u.", "force")
-    assert any(n.startswith("no unit stated") for n in found.notices) == ("counts" not in name)
+    assert noticed(found, "no unit stated") == ("counts" not in name)
     target = found.target()
     assert target.quantity == "force" and target.mean_force is None
     assert target.coefficient_of_variation == (found.summary().coefficient_of_variation,)
@@ -225,7 +223,7 @@ def test_gravity_is_no_level(unit, scale):
     found = jm.steadiness(jm.Recording(x, RATE, unit=unit))
     names = ("coefficient_of_variation", "relative_power_4_8")
     assert all(math.isnan(found[name].value) for name in names)
-    assert any("gravity and offset of the sensor" in notice for notice in found.notices)
+    assert noticed(found, "gravity and offset of the sensor")
     assert found["tremor_size"].unit == unit
     assert found["tremor_size"].value == pytest.approx(0.05 * scale / math.sqrt(2), rel=0.1)
 
@@ -252,7 +250,7 @@ def test_slow_recordings_have_a_steadiness(rate):
     left_out = rate < 24
     assert math.isnan(found["power_8_12"].value) == left_out
     assert math.isnan(found["share_above_12"].value) == left_out
-    assert any("is left out" in notice for notice in found.notices) == left_out
+    assert noticed(found, "is left out") == left_out
     expected = np.std(x) / np.mean(x)
     assert found["coefficient_of_variation"].value == pytest.approx(expected, rel=0.02)
     assert found["tremor_frequency"].value == pytest.approx(7, abs=0.2)
@@ -283,7 +281,7 @@ def test_analyse_says_that_a_record_is_moved(size, moved, tmp_path):
     rng, t = np.random.default_rng(8), np.arange(600) / RATE
     table = np.stack([t, X, 10 + size * rng.normal(size=t.size)], 1)
     path = tmp_path / "torque.csv"
-    np.savetxt(path, table, delimiter=",", header="time_s,torque_Nm,angle_deg", comments="")
+    save_columns(path, "time_s,torque_Nm,angle_deg", *table.T)
     (notice,) = jm.load_recording(path).notices
     assert ("`jaxmuscle fit` takes it for a record of a moved insertion" in notice) == moved
     assert ("angle_deg rests" in notice) == (not moved)
@@ -296,7 +294,7 @@ def test_a_moved_record_needs_the_unit_of_the_force(tmp_path):
     length = np.random.default_rng(9).normal(size=600)
     table = np.stack([np.arange(600) / RATE, X, length], 1)
     path = tmp_path / "moved.csv"
-    np.savetxt(path, table, delimiter=",", header="time_s,force,length_mm", comments="")
+    save_columns(path, "time_s,force,length_mm", *table.T)
     with pytest.raises(ValueError, match="in which unit force is; give `units`, as units='N'"):
         jm.load_recording(path, force="force", displacement="length_mm")
     assert jm.load_recording(path, force="force", displacement="length_mm", units="N").rate == RATE

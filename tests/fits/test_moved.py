@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands.console import write_fit
 from jaxmuscle.commands.main import app
-from jaxmuscle.data._frequency_response_files import is_frequency_response
+from jaxmuscle.data import kind_of_file
 from jaxmuscle.data._perturbed import LINEAR
 from jaxmuscle.fits import _perturbed
 from jaxmuscle.fits._checks import reach_notices
@@ -111,7 +111,8 @@ def test_a_response_alone_is_fitted_from_the_command_line(fitted):
     again = jm.load_frequency_response(folder / "stiffness.csv")  # which can be fitted alone
     np.testing.assert_allclose(again.value, given.value, rtol=1e-7)
     np.testing.assert_allclose(again.stderr, given.stderr, rtol=1e-7)
-    assert again.name == "stiffness" and is_frequency_response(folder / "stiffness.csv")
+    assert again.name == "stiffness"
+    assert kind_of_file(folder / "stiffness.csv") == "frequency response"
     off = (given.value - own) / given.stderr
     np.testing.assert_allclose(result.only.stiffness_residual, off, rtol=1e-5, atol=1e-5)
     assert result.only.chi2_per_point == pytest.approx(
@@ -507,11 +508,7 @@ def test_what_is_taken_off_is_as_nonlinear_as_the_recording(share):
     with jax.enable_x64(True):
         recording, own = specimen(3, answer)
         seen = seen_with(muscle, [recording])
-    alone = (
-        jm.Recording.from_array(own, RATE)
-        .steady(recording.force.window)
-        .target(settings=seen.settings)
-    )
+    alone = jm.Recording(own, RATE).steady(recording.force.window).target(settings=seen.settings)
     apart = np.log(seen.proportional_power / alone.proportional_power)
     # left in, the nonlinear answer more than doubles the power near 5 Hz
     assert np.sqrt(np.mean(apart**2)) < 0.1

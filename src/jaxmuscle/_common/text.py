@@ -68,11 +68,10 @@ def choices(word: object, options: Iterable[str]) -> str:
     )
 
 
-def listed(items: Sequence | np.ndarray) -> str:
-    """The first ten of some numbers or names."""
-    return ", ".join(str(item) for item in items[:10]) + (
-        f" and {len(items) - 10} more" if len(items) > 10 else ""
-    )
+def listed(items: Sequence | np.ndarray, most: int = 10) -> str:
+    """The first of some numbers or names, by default ten, and how many more there are."""
+    more = f" and {len(items) - most} more" if len(items) > most else ""
+    return ", ".join(str(item) for item in items[:most]) + more
 
 
 def printable(text: str) -> str:

@@ -51,9 +51,8 @@ def compare(
         str,
         typer.Argument(
             help=(
-                "A bundled spectrum (see `jaxmuscle targets`), the file of one (.toml, .csv, .json,"
-                " .tar), or "
-                "the fit.json of a fit, whose spectrum is taken."
+                "A bundled spectrum (see `jaxmuscle targets`), the file of one (.toml, .csv), or"
+                " the fit.json of a fit, whose spectrum is taken."
             )
         ),
     ],

@@ -57,7 +57,8 @@ def aim_of(name: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any,
 
     A recording's steady part is found by itself.
     """
-    return aimed(jm.data.as_target(name, **({} if jm.data.is_recording(name) else read)), task)
+    recorded = jm.data.kind_of_file(name) == "recording"
+    return aimed(jm.data.as_target(name, **({} if recorded else read)), task)
 
 
 def aimed(target: Any, task: TaskName | None) -> tuple[Any, Any]:

@@ -72,8 +72,8 @@ def fit(
         list[str],
         typer.Argument(
             help=(
-                "A bundled spectrum (see `jaxmuscle targets`), your spectra (.toml, .csv, .json,"
-                " .tar), or your recordings."
+                "A bundled spectrum (see `jaxmuscle targets`), your spectra (.toml, .csv), or"
+                " your recordings."
             )
         ),
     ],
@@ -232,7 +232,7 @@ def fit(
 
         jaxmuscle fit people/*.toml --groups groups.csv --out out/cohort
 
-        jaxmuscle fit figure.tar --dataset "95 MVC" --segments 6
+        jaxmuscle fit figure.csv --dataset "95 MVC" --segments 6
     """
     with reporting(as_json):
         options: dict[str, Any] = {
@@ -328,7 +328,7 @@ def _check_mvc(mvc: float | None, *, held: bool) -> None:
 def _are_recordings(targets: list[str], holds: list[str] | None) -> bool:
     """Whether the targets are recordings, not spectra; a `ValueError` for both at once, or for
     holds beside spectra."""
-    recorded = [jm.data.is_recording(name) for name in targets]
+    recorded = [jm.data.kind_of_file(name) == "recording" for name in targets]
     # of several spectra the others are fitted all the same
     if len(targets) == 1 or any(recorded):
         require_files(targets)
@@ -404,7 +404,7 @@ def _aim_at_spectrum(
     read: dict[str, Any],
 ) -> tuple[Any, Any]:
     """The target of a spectrum or a frequency response, and the task to fit to it."""
-    if not jm.data.is_frequency_response(name):
+    if jm.data.kind_of_file(name) != "frequency response":
         unused(reading, "axis", "quantity", window=window, what="recordings; this is a spectrum")
         return aim_of(name, task, read)
     what = "recordings; this is a frequency response"

@@ -1,9 +1,8 @@
 """Public names of this wing."""
 
 from ._as_target import as_target as as_target
-from ._as_target import is_recording as is_recording
+from ._as_target import kind_of_file as kind_of_file
 from ._frequency_response import FrequencyResponse as FrequencyResponse
-from ._frequency_response_files import is_frequency_response as is_frequency_response
 from ._frequency_response_files import load_frequency_response as load_frequency_response
 from ._measure import Measure as Measure
 from ._perturbed import PerturbedRecording as PerturbedRecording

@@ -42,46 +42,36 @@ ALONE = {
 }
 
 
-def read_apart(path: Path, kind: str, error: type[ValueError] = ValueError, **words: str) -> Any:
-    """The channels of the file at `path`, or the text or sheets that it is made of, read as `kind`
-    in a process of its own.
+def read_apart(
+    path: Path, kind: str, instead: str = "a recording"
+) -> list[Channel] | dict[str, bytes]:
+    """The channels of the file at `path`, or the sheets that it is made of, read as `kind` in a
+    process of its own. `instead`, as in `looked_at`.
 
-    **Arguments:** `words`, as in `looked_at`.
-
-    **Returns:** a list of `Channel`s, bytes, or the bytes of every sheet.
-
-    **Raises:** `error` naming the file, also where that process crashes, needs too much memory or
-    time; `ImportError` that says what to install.
+    **Raises:** `ValueError` naming the file, also where that process crashes, needs too much memory
+    or time; `ImportError` that says what to install.
     """
-    size = looked_at(path, error, **words)
+    size = looked_at(path, instead=instead)
     if size == 0:
-        raise error(f"{path}: is empty")
+        raise ValueError(f"{path}: is empty")
     seconds = SECONDS + EACH * math.ceil(size / 2**20)
-    paths = [entry for entry in sys.path if isinstance(entry, str)]
     request = {
         "path": str(path.absolute()),
         "kind": kind,
         "most": most(),
         "seconds": seconds,
-        "paths": paths,
+        "paths": [entry for entry in sys.path if isinstance(entry, str)],
     }
-    with _reading(request, error) as (process, late):
+    with _start(request) as (process, late):
+        answer = process.stdout
         return understood(
-            path,
-            kind,
-            process.stdout,
-            lambda: _ended(process.wait(), seconds, late=late.is_set()),
-            error,
+            path, kind, answer, lambda: _ended(process.wait(), seconds, late=late.is_set())
         )
 
 
 def understood(
-    path: Path,
-    kind: str,
-    stream: io.BufferedIOBase,
-    ended: Callable[[], str],
-    error: type[ValueError] = ValueError,
-) -> Any:
+    path: Path, kind: str, stream: io.BufferedIOBase, ended: Callable[[], str]
+) -> list[Channel] | dict[str, bytes]:
     """What the process that reads the file at `path` hands over by `stream`; `ended` says why it
     ended before.
 
@@ -94,13 +84,11 @@ def understood(
     except (ValueError, EOFError) as reason:
         said = ended() if isinstance(reason, EOFError) else str(reason)
         said = said.replace(f"{path.absolute()}: ", "").replace(str(path.absolute()), str(path))
-        raise error(f"{path}: cannot be read as {kind}: {printable(said)}") from None
+        raise ValueError(f"{path}: cannot be read as {kind}: {printable(said)}") from None
 
 
 @contextlib.contextmanager
-def _reading(
-    request: dict[str, Any], error: type[ValueError]
-) -> Iterator[tuple[Any, threading.Event]]:
+def _start(request: dict[str, Any]) -> Iterator[tuple[Any, threading.Event]]:
     """The process that reads, which is gone at the end, and whether it has taken too long."""
     command = [multiprocessing.spawn.get_executable(), "-B", "-P", "-c", BEGIN]
     try:
@@ -113,7 +101,7 @@ def _reading(
             creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # of Windows
         )
     except OSError as reason:
-        raise error(
+        raise ValueError(
             f"{request['path']}: cannot be read: no process can be started for it: {reason}"
         ) from None
     late = threading.Event()
@@ -138,7 +126,7 @@ def _reading(
         process.stdout.close()
 
 
-def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes | dict[str, bytes]:
+def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | dict[str, bytes]:
     """What the process hands over; not trusted, since the file may have taken it over.
 
     **Raises:** `EOFError` where it ends before it has said all; `ValueError` with the words for
@@ -150,14 +138,10 @@ def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes |
     try:
         head = json.loads(line)
         large, missing, wrong = head.get("large"), head.get("missing"), head.get("wrong")
-        single = {"": head["text"]} if "text" in head else {}
-        sizes = single or dict(head.get("sheets", ()))
-        if not all(isinstance(size, int) and size >= 0 for size in sizes.values()):
-            raise TypeError
+        sheets = [(printable(str(name)), _count(size)) for name, size in head.get("sheets", ())]
         described = [_described(*entry) for entry in head.get("channels", ())]
-        total = sum(sizes.values()) + sum(
-            np.dtype(kind).itemsize * count for _, kind, count, *_ in described
-        )
+        total = sum(size for _, size in sheets)
+        total += sum(np.dtype(kind).itemsize * count for _, kind, count, *_ in described)
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         raise ValueError("it is damaged, and the answer of its reader makes no sense") from None
     if missing is not None:
@@ -169,44 +153,41 @@ def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes |
             f"it holds more than {allowed / 2**30:.3g} GiB, or says so because it is"
             f" damaged{BEYOND}"
         )
-    texts = {
-        printable(str(name)): _filled(stream, np.empty(size, np.uint8)).tobytes()
-        for name, size in sizes.items()
-    }
-    if texts:
-        return texts[""] if single else texts
+    if sheets:
+        return {name: _filled(stream, "|u1", size).tobytes() for name, size in sheets}
     if not described:
         raise ValueError("holds no channels with numbers")
     return [
-        Channel(name, _filled(stream, np.empty(count, kind)), rate, unit, alias)
+        Channel(name, _filled(stream, kind, count), rate, unit, alias)
         for name, kind, count, rate, unit, alias in described
     ]
+
+
+def _count(size: Any) -> int:
+    if not isinstance(size, int) or size < 0:
+        raise TypeError
+    return size
 
 
 def _described(
     name: Any, kind: Any, count: Any, rate: Any, unit: Any, alias: Any = ""
 ) -> tuple[str, str, int, float | None, str, str]:
-    if kind not in TYPES or not isinstance(count, int) or count < 0:
+    if kind not in TYPES:
         raise TypeError
     stated = math.nan if rate is None else float(rate)
-    return (
-        printable(str(name)),
-        kind,
-        count,
-        stated if 0 < stated < math.inf else None,
-        printable(str(unit)),
-        printable(str(alias)),
-    )
+    name, unit, alias = (printable(str(text)) for text in (name, unit, alias))
+    return name, kind, _count(count), stated if 0 < stated < math.inf else None, unit, alias
 
 
-def _filled(stream: io.BufferedIOBase, array: np.ndarray) -> np.ndarray:
-    view = array.data.cast("B") if array.size else memoryview(b"")
-    done = 0
-    while done < len(view):
-        count = stream.readinto(view[done:])
-        if not count:
+def _filled(stream: io.BufferedIOBase, kind: str, count: int) -> np.ndarray:
+    array = np.empty(count, kind)
+    # an empty array has no view of bytes
+    view = array.data.cast("B") if count else memoryview(b"")
+    while len(view):
+        size = stream.readinto(view)
+        if not size:
             raise EOFError
-        done += count
+        view = view[size:]
     return array
 
 

@@ -9,41 +9,30 @@ import io
 import json
 import os
 import signal
-import tarfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ._recording_channels import TYPES, Channel, TooLarge, distinct
-from ._recording_formats import read_c3d, read_mat, read_npy, read_npz
-from ._recording_labs import read_acq, read_edf, read_smr, read_tdms, read_xlsx
+from ._recording_formats import (
+    read_acq,
+    read_c3d,
+    read_edf,
+    read_mat,
+    read_npy,
+    read_npz,
+    read_smr,
+    read_tdms,
+    read_xlsx,
+)
 
 LIBRARIES = 2 << 30  # bytes of address space that Python and the libraries take
 COPIES = 2  # of what a file holds that a reader may have at once
 WORDS = 300
 
 
-def read_tar(path: str, most: int) -> bytes:
-    """The project in an archive of WebPlotDigitizer: wpd.json."""
-    try:
-        with tarfile.open(path, "r:") as archive:
-            for member in archive:
-                content = (
-                    archive.extractfile(member)
-                    if member.name.split("/")[-1] == "wpd.json"
-                    else None
-                )
-                if content is not None and member.size > most:
-                    raise TooLarge
-                if content is not None:
-                    return content.read()
-    except (tarfile.TarError, EOFError, OSError):
-        raise ValueError("is not a tar archive") from None
-    raise ValueError("holds no wpd.json, so it is not a WebPlotDigitizer project")
-
-
-READERS: dict[str, Callable[[str, int], list[Channel] | bytes | dict[str, bytes]]] = {
+READERS: dict[str, Callable[[str, int], list[Channel] | dict[str, bytes]]] = {
     ".xlsx": read_xlsx,
     ".xlsm": read_xlsx,
     ".mat": read_mat,
@@ -55,7 +44,6 @@ READERS: dict[str, Callable[[str, int], list[Channel] | bytes | dict[str, bytes]
     ".tdms": read_tdms,
     ".acq": read_acq,
     ".smr": read_smr,
-    ".tar": read_tar,
 }
 
 
@@ -92,40 +80,32 @@ def limit(most: int, seconds: int) -> None:
 
 
 def answer(request: dict[str, Any], out: io.BufferedIOBase) -> None:
-    """One line of JSON that says what follows, or what is wrong; then the bytes of the texts, or of
-    all samples."""
-    head: dict[str, Any]
-    parts: Iterator[Any] = iter(())
+    """One line of JSON that says what follows, or what is wrong; then the bytes of the sheets, or
+    of all samples."""
+    parts: list[Any] = []
     try:
         found = READERS[request["kind"]](request["path"], request["most"])
-        if isinstance(found, bytes):
-            head, parts, size = {"text": len(found)}, iter((found,)), len(found)
-        elif isinstance(found, dict):
-            sizes = {name: len(text) for name, text in found.items()}
-            head, parts, size = (
-                {"sheets": [*sizes.items()]},
-                iter(found.values()),
-                sum(sizes.values()),
-            )
+        if isinstance(found, dict):
+            parts = [np.frombuffer(text, np.uint8) for text in found.values()]
+            head = {"sheets": [(name, len(text)) for name, text in found.items()]}
         else:
-            channels = [
-                channel._replace(samples=_plain(channel.samples)) for channel in distinct(found)
-            ]
+            channels = [each._replace(samples=_plain(each.samples)) for each in distinct(found)]
+            parts = [channel.samples for channel in channels]
             head = {"channels": [_described(channel) for channel in channels]}
-            parts, size = map(_bytes, channels), sum(c.samples.nbytes for c in channels)
-        if size > request["most"]:
+        if sum(part.nbytes for part in parts) > request["most"]:
             raise TooLarge
         line = json.dumps(head)
     except (MemoryError, TooLarge):
-        line, parts = json.dumps({"large": True}), iter(())
+        line, parts = json.dumps({"large": True}), []
     except ImportError as error:
-        line, parts = json.dumps({"missing": str(error)}), iter(())
+        line, parts = json.dumps({"missing": str(error)}), []
     except Exception as error:  # damaged files make the libraries fail in any way
         words = " ".join(str(error).split()) or type(error).__name__
-        line, parts = json.dumps({"wrong": words[:WORDS]}), iter(())
+        line, parts = json.dumps({"wrong": words[:WORDS]}), []
     out.write(line.encode() + b"\n")
     for part in parts:
-        out.write(part)
+        if part.size:  # an empty array has no view of bytes
+            out.write(np.ascontiguousarray(part).data.cast("B"))
 
 
 def _plain(samples: Any) -> np.ndarray:
@@ -139,11 +119,3 @@ def _described(channel: Channel) -> list[Any]:
     rate = None if channel.rate is None else float(channel.rate)
     samples = channel.samples
     return [channel.name, samples.dtype.str, samples.size, rate, channel.unit, channel.alias]
-
-
-def _bytes(channel: Channel) -> memoryview:
-    return (
-        np.ascontiguousarray(channel.samples).data.cast("B")
-        if channel.samples.size
-        else memoryview(b"")
-    )

@@ -4,12 +4,12 @@ both."""
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from jaxmuscle._common.errors import TargetError
 
 from ._frequency_response import FrequencyResponse
-from ._frequency_response_files import is_frequency_response, is_response, load_frequency_response
+from ._frequency_response_files import is_response, load_frequency_response
 from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_files import KINDS, ROWS, is_text
@@ -19,7 +19,13 @@ from ._text_tables import TEXT, beginning, cells_of, is_number
 from ._trials import Trials, load_recordings
 from .dialects._dialects import EXPORTS
 
+Kind = Literal["recording", "spectrum", "frequency response"]
 POINTS = 500  # more than a figure of a spectrum has
+# which options say how it is read
+OPTIONS = {
+    "a spectrum": ("quantity", "segments", "dataset", "axis"),
+    "a frequency response": ("segments", "lever_arm"),
+}
 
 
 def as_target(
@@ -56,35 +62,33 @@ def as_target(
         "lever_arm": lever_arm,
     }
     options = {name: value for name, value in asked.items() if value is not None}
+    if isinstance(given, str | os.PathLike):
+        kind = kind_of_file(given)
+        _check_options(options, f"a {kind}")
+        if kind == "spectrum":
+            return load_target(given, **options)
+        given = [given] if kind == "recording" else load_frequency_response(given, **options)
+    else:
+        read = isinstance(given, Target | FrequencyResponse)
+        _check_options(options, "a target" if read else "a recording")
     if isinstance(given, Target):
-        _check_options(options, (), "a target")
         return given
-    if isinstance(given, Recording | Trials | PerturbedRecording):
-        _check_options(options, (), "a recording")
-        return given.target()
-    if isinstance(given, str | os.PathLike) and is_frequency_response(given):
-        _check_options(options, ("segments", "lever_arm"), "a frequency response")
-        given = load_frequency_response(given, **options)
     if isinstance(given, FrequencyResponse):
         return Target(given.name, None, source=given.source, stiffness=given, notices=given.notices)
-    if isinstance(given, str | os.PathLike):
-        if not is_recording(given):
-            _check_options(options, ("quantity", "segments", "dataset", "axis"), "a spectrum")
-            return load_target(given, **options)
-        given = [given]
+    if isinstance(given, Recording | Trials | PerturbedRecording):
+        return given.target()
     if isinstance(given, Sequence) and len(given) > 0:
-        _check_options(options, (), "a recording")
         if all(isinstance(one, Recording) for one in given):
             return Trials(given).target()
-        if all(isinstance(one, str | os.PathLike) and is_recording(one) for one in given):
+        if are_recordings(given):
             return load_recordings(given).steady().target()
     raise TargetError(_remedy(given))
 
 
-def _check_options(options: Mapping[str, Any], known: tuple[str, ...], what: str) -> None:
+def _check_options(options: Mapping[str, Any], what: str) -> None:
     """Refuse what does not say how this is read."""
     for name, value in options.items():
-        if name not in known:
+        if name not in OPTIONS.get(what, ()):
             raise TargetError(f"{name} = {value!r}: does not belong to {what}; leave it out")
 
 
@@ -110,35 +114,45 @@ def _remedy(given: Any) -> str:
     return f"{what} {usual}"
 
 
-def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Whether the file at `path` holds a recording rather than a spectrum: by its ending, a text by
-    its header and rows.
+def are_recordings(given: Sequence[Any]) -> bool:
+    """Whether all of these are paths of recordings."""
+    return all(
+        isinstance(one, str | os.PathLike) and kind_of_file(one) == "recording" for one in given
+    )
 
-        jm.data.is_recording("trial.csv")
+
+def kind_of_file(path: str | os.PathLike[str]) -> Kind:
+    """What a `path` leads to, "recording", "spectrum" or "frequency response": by its ending,
+    a text by its header and rows. What is no file is taken for the name of a spectrum.
+
+        jm.data.kind_of_file("trial.csv")
 
     It is read for that.
     """
     path = Path(path).expanduser()
-    kind = path.suffix.lower()
-    if kind not in TEXT or not path.is_file():
-        return (kind in (*KINDS, *EXPORTS) and kind != ".csv") or is_text(path)
+    ending = path.suffix.lower()
+    if ending not in TEXT or not path.is_file():
+        recorded = (ending in (*KINDS, *EXPORTS) and ending != ".csv") or is_text(path)
+        return "recording" if recorded else "spectrum"
     rows, names, delimiter = beginning(path)
+    if rows and is_response(names):
+        return "frequency response"
+    return "recording" if _is_recorded(rows, names, delimiter, ending) else "spectrum"
+
+
+def _is_recorded(rows: list[str], names: list[str], delimiter: str | None, ending: str) -> bool:
+    """Whether a text holds samples over time, by its first rows and the cells of the first."""
     if not rows:
-        return kind != ".csv"
-    if is_response(names):
-        return False
+        return ending != ".csv"
     if all(is_number(name, delimiter) for name in names):
-        return len(rows) > (POINTS if kind == ".csv" else ROWS)
+        return len(rows) > (POINTS if ending == ".csv" else ROWS)
     # a column f beside a time is a force
     spectral = {column_role(name)[0] for name in names} >= set(NAMES[:2]) or any(
         name.startswith(("freq", "proportional", "power")) for name in names
     )
+    second = cells_of(rows[1], delimiter) if len(rows) > 1 else []
+    if ending == ".csv":
+        figure = {cell.casefold() for cell in second} == {"x", "y"}
+        return not spectral and not figure and len(rows) > ROWS
     # above the columns of a laboratory's text may stand a line "Frequency: 1000"
-    if kind != ".csv":
-        return not (
-            spectral
-            and len(names) > 1
-            and all(is_number(cell, delimiter) for cell in cells_of(rows[1], delimiter))
-        )
-    figure = len(rows) > 1 and set(map(str.casefold, cells_of(rows[1], delimiter))) == {"x", "y"}
-    return not spectral and not figure and len(rows) > ROWS
+    return not (spectral and len(names) > 1 and all(is_number(cell, delimiter) for cell in second))

@@ -2,7 +2,7 @@
 errors."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,16 +13,18 @@ from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.arguments import require
-from jaxmuscle._common.cards import Printed
+from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.documents import Table, checked, says
 from jaxmuscle._common.files import write_text
-from jaxmuscle._common.text import folded, probability
+from jaxmuscle._common.text import probability
 
 from ._second_order import parts, second_order_shape
 from ._target_fields import frozen
 
 Numbers = list[float]
+Bins = Float[np.ndarray, " bins"]
 UNSEEN = 1e-3  # how probable by chance a response may be at most, to be one
+SQUARED = "give the squared coherence, 0 to 1"
 COLUMNS = ("frequency_hz", "gain_N/m", "phase_deg", "stderr_N/m", "coherence")
 
 
@@ -46,7 +48,7 @@ class ResponseTable(Table, kw_only=True):
     )
 
 
-class FrequencyResponse(Printed, eqx.Module):
+class FrequencyResponse(Shown, eqx.Module):
     """The dynamic stiffness of a muscle: force per lengthening of its insertion, over frequency.
 
         H(f) = F(f) / X(f)  [N/m]
@@ -67,10 +69,10 @@ class FrequencyResponse(Printed, eqx.Module):
     **Raises:** `ValueError` naming the argument, the entry and the remedy.
     """
 
-    frequency: Float[np.ndarray, " bins"]
+    frequency: Bins
     value: Complex[np.ndarray, " bins"]
-    stderr: Float[np.ndarray, " bins"]
-    coherence: Float[np.ndarray, " bins"] | None
+    stderr: Bins
+    coherence: Bins | None
     name: str = eqx.field(static=True)
     source: str = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
@@ -86,36 +88,20 @@ class FrequencyResponse(Printed, eqx.Module):
         source: str = "given by the user",
         notices: Iterable[str] = (),
     ):
-        self.frequency = _column("frequency", frequency, None)
+        rising = "give rising frequencies above 0 Hz, each once"
+        self.frequency = _column("frequency", frequency, None, _rises, rising)
         size = self.frequency.size
-        rising = (
-            (self.frequency > 0)
-            & (np.diff(self.frequency, prepend=0.0) > 0)
-            & (self.frequency < np.inf)
+        usable = "give finite numbers other than 0"
+        self.value = _column("value", value, size, _is_usable, usable, complex)
+        above = "give standard errors above 0, infinite where a value is of no use"
+        self.stderr = _column("stderr", stderr, size, lambda error: error > 0, above)
+        one = bool(np.any(np.isfinite(self.stderr)))
+        require(one, "stderr", "all infinite", "give one that is finite")
+        self.coherence = (
+            None
+            if coherence is None
+            else _column("coherence", coherence, size, lambda x: (x >= 0) & (x <= 1), SQUARED)
         )
-        _require_all(
-            rising, "frequency", self.frequency, "give rising frequencies above 0 Hz, each once"
-        )
-        self.value = _column("value", value, size, complex)
-        _require_all(
-            np.isfinite(self.value) & (self.value != 0),
-            "value",
-            self.value,
-            "give finite numbers other than 0",
-        )
-        self.stderr = _column("stderr", stderr, size)
-        remedy = "give standard errors above 0, infinite where a value is of no use"
-        _require_all(self.stderr > 0, "stderr", self.stderr, remedy)
-        require(
-            bool(np.any(np.isfinite(self.stderr))),
-            "stderr",
-            "all infinite",
-            "give one that is finite",
-        )
-        self.coherence = None if coherence is None else _column("coherence", coherence, size)
-        if self.coherence is not None:
-            inside = (self.coherence >= 0) & (self.coherence <= 1)
-            _require_all(inside, "coherence", self.coherence, "give the squared coherence, 0 to 1")
         self.name, self.source, self.notices = name, source, tuple(notices)
 
     @classmethod
@@ -154,33 +140,21 @@ class FrequencyResponse(Printed, eqx.Module):
         **Source:** Bendat & Piersol, Random Data, 4th ed. 2010, section 9.2 (docs/perturbed.md
         derives it).
         """
-        frequency = _column("frequency", frequency, None)
-        gain, phase = (_column(n, v, frequency.size) for n, v in (("gain", gain), ("phase", phase)))
-        _require_all(
-            gain > 0, "gain", gain, "give positive numbers; a negative stiffness has the phase 180"
-        )
+        size = np.size(frequency)
+        real = "give positive numbers; a negative stiffness has the phase 180"
+        gain = _column("gain", gain, size, lambda x: x > 0, real)
+        phase = _column("phase", phase, size, np.isfinite, "give finite numbers")
         if stderr is None:
             if coherence is None or segments is None:
                 raise ValueError(
                     "stderr: is not known; give it, or the coherence and the number of independent"
                     " averages, as coherence=[0.9, ...], segments=40"
                 )
-            shared = _column("coherence", coherence, frequency.size)
-            _require_all(
-                (shared >= 0) & (shared <= 1),
-                "coherence",
-                shared,
-                "give the squared coherence, 0 to 1",
-            )
-            remedy = "the formula has no error for a coherence of 1; give `stderr`"
-            _require_all(shared < 1, "coherence", shared, remedy)
-            averages = np.broadcast_to(np.asarray(segments, float), frequency.shape)
-            _require_all(
-                averages >= 1,
-                "segments",
-                averages,
-                "give the number of independent averages, at least 1",
-            )
+            remedy = f"{SQUARED}; of 1 the formula has no error: give `stderr`"
+            shared = _column("coherence", coherence, size, lambda x: (x >= 0) & (x < 1), remedy)
+            averages = np.broadcast_to(np.asarray(segments, float), shared.shape)
+            remedy = "give the number of independent averages, at least 1"
+            _column("segments", averages, size, lambda count: count >= 1, remedy)
             with np.errstate(divide="ignore"):
                 stderr = gain * np.sqrt((1 - shared) / (2 * averages * shared))
         value = gain * np.exp(1j * np.radians(phase))
@@ -192,34 +166,32 @@ class FrequencyResponse(Printed, eqx.Module):
         kept = np.isfinite(self.stderr)
         if np.all(kept):
             return self
-        shared = None if self.coherence is None else self.coherence[kept]
-        fields = {"name": self.name, "source": self.source, "notices": self.notices}
-        return FrequencyResponse(
-            self.frequency[kept], self.value[kept], self.stderr[kept], shared, **fields
-        )
+        arrays = (self.frequency, self.value, self.stderr, self.coherence)
+        part = (None if array is None else array[kept] for array in arrays)
+        return FrequencyResponse(*part, name=self.name, source=self.source, notices=self.notices)
 
     @property
-    def gain(self) -> Float[np.ndarray, " bins"]:
+    def gain(self) -> Bins:
         """`|H|` [N/m]."""
         return np.abs(self.value)
 
     @property
-    def phase(self) -> Float[np.ndarray, " bins"]:
+    def phase(self) -> Bins:
         """The phase of H [deg], -180 to 180: positive where the force leads the lengthening."""
         return np.degrees(np.angle(self.value))
 
     @property
-    def gain_stderr(self) -> Float[np.ndarray, " bins"]:
+    def gain_stderr(self) -> Bins:
         """Standard error of the gain [N/m]."""
         return self.stderr
 
     @property
-    def phase_stderr(self) -> Float[np.ndarray, " bins"]:
+    def phase_stderr(self) -> Bins:
         """Standard error of the phase [deg], to first order in stderr / gain."""
         return np.degrees(self.stderr / self.gain)
 
     @property
-    def averages(self) -> Float[np.ndarray, " bins"] | None:
+    def averages(self) -> Bins | None:
         """How many independent averages errors and coherence imply: K = (1 - γ²) gain² / (2 γ²
         stderr²); or `None`."""
         if self.coherence is None:
@@ -250,22 +222,23 @@ class FrequencyResponse(Printed, eqx.Module):
         """
         one, shared = self.known, (1.0, 1.0)
         size = (np.abs(one.value) / one.stderr) ** 2
-        seen = size
+        squares = size
         if one.averages is not None:
+            # fewer than one average and a bit would be divided by nothing
             spare, shared = np.maximum(2 * (one.averages - 1), 1e-3), (1.4, 1.9)
-            seen = spare * np.log1p(size / spare)
-        weight = np.tile(np.sqrt(seen / size) / one.stderr, 2)
+            squares = spare * np.log1p(size / spare)
+        weight = np.tile(np.sqrt(squares / size) / one.stderr, 2)
         shapes = [
             parts(second_order_shape(one.frequency, unit)) / np.tile(one.stderr, 2)
             for unit in np.eye(3)
         ]
         basis = np.linalg.qr(np.stack(shapes, axis=1))[0]
         along = np.sum((basis.T @ (parts(one.value) * weight)) ** 2)
-        both = (
-            (seen.sum() / shared[0], 2 * seen.size / shared[0]),
-            (along / shared[1], min(3, 2 * seen.size)),
+        count = 2 * squares.size
+        p = scipy.stats.chi2.sf(
+            np.divide([squares.sum(), along], shared), [count / shared[0], min(3, count)]
         )
-        return float(min(1.0, 2 * min(scipy.stats.chi2.sf(value, count) for value, count in both)))
+        return float(min(1.0, 2 * p.min()))
 
     def to_table(self) -> dict[str, Any]:
         """The response as plain lists, for TOML and JSON; an infinite error is the text "inf"."""
@@ -285,23 +258,13 @@ class FrequencyResponse(Printed, eqx.Module):
         """The reverse of `to_table`, exactly. Raises `ValueError` for a key that is missing,
         unknown or of a wrong type."""
         said = checked(dict(table), ResponseTable, "stiffness")
-        require(
-            len(said.real) == len(said.imaginary),
-            "imaginary",
-            len(said.imaginary),
-            f"give {len(said.real)} numbers, as in real",
-        )
+        count = len(said.real)
+        equal = len(said.imaginary) == count
+        require(equal, "imaginary", len(said.imaginary), f"give {count} numbers, as in real")
         value = np.asarray(said.real, float) + 1j * np.asarray(said.imaginary, float)
-        stderr = [float(error) for error in said.stderr]
-        return cls(
-            said.frequency_hz,
-            value,
-            stderr,
-            said.coherence,
-            name=said.name,
-            source=said.source,
-            notices=said.notices,
-        )
+        words = {"name": said.name, "source": said.source, "notices": said.notices}
+        stderr = np.array(said.stderr, float)
+        return cls(said.frequency_hz, value, stderr, said.coherence, **words)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a CSV that `jaxmuscle.load_frequency_response` reads; an existing file is replaced
@@ -328,33 +291,26 @@ class FrequencyResponse(Printed, eqx.Module):
         `jaxmuscle.plot.frequency_response`; returns the figure."""
         return plot.frequency_response(self, ax)
 
-    def __str__(self) -> str:
-        f, error = self.frequency, self.stderr / self.gain
-        lines = [
-            (
-                f"{self.name}: dynamic stiffness [N/m], {f.size} frequencies from {f[0]:.3g} to"
-                f" {f[-1]:.3g} Hz"
-            ),
-            f"  source    {self.source}",
-            (
-                f"  gain      {self.gain.min():.4g} to {self.gain.max():.4g} N/m, standard error"
-                f" {100 * np.median(error):.2g} % (median)"
-            ),
-            f"  phase     {self.phase.min():.0f} to {self.phase.max():.0f} deg",
+    def _card(self) -> Card:
+        f, gain, phase, shared = self.frequency, self.gain, self.phase, self.coherence
+        error = f"{100 * np.median(self.stderr / gain):.2g} %"
+        known = [
+            ("source", self.source),
+            ("gain", f"{gain.min():.4g} to {gain.max():.4g} N/m, standard error {error} (median)"),
+            ("phase", f"{phase.min():.0f} to {phase.max():.0f} deg"),
         ]
-        if self.coherence is not None:
-            low = int(np.argmin(self.coherence))
-            median = np.median(self.coherence)
-            lines.append(
-                f"  coherence {median:.2f} (median), lowest {self.coherence[low]:.2f} at"
-                f" {f[low]:.3g} Hz"
-            )
-        if self.p_none > UNSEEN:
-            lines.append(
-                "  notice    the force does not follow the displacement: no gain is larger than"
-                " chance makes it. Is this the channel that moved the insertion?"
-            )
-        return folded(lines + [f"  notice    {notice}" for notice in self.notices])
+        if shared is not None:
+            low = int(np.argmin(shared))
+            lowest = f"lowest {shared[low]:.2f} at {f[low]:.3g} Hz"
+            known.append(("coherence", f"{np.median(shared):.2f} (median), {lowest}"))
+        unseen = (
+            "the force does not follow the displacement: no gain is larger than chance makes it."
+            " Is this the channel that moved the insertion?"
+        )
+        notices = (*((unseen,) if self.p_none > UNSEEN else ()), *self.notices)
+        known += [("notice", notice) for notice in notices]
+        span = f"{f.size} frequencies from {f[0]:.3g} to {f[-1]:.3g} Hz"
+        return facts(f"{self.name}: dynamic stiffness [N/m], {span}", known, width=9)
 
 
 def check_seen(response: FrequencyResponse, whose: str) -> None:
@@ -371,24 +327,31 @@ def check_seen(response: FrequencyResponse, whose: str) -> None:
     )
 
 
-def _column(name: str, given: Any, size: int | None, kind: type = float) -> Any:
+def _column(
+    name: str,
+    given: Any,
+    size: int | None,
+    holds: Callable[[Any], Any],
+    remedy: str,
+    kind: type = float,
+) -> Any:
+    """A number for each frequency, of which all must hold."""
     try:
         values = np.array(given, dtype=kind)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: give numbers, one for each frequency") from None
-    remedy = (
-        "give a list of numbers" if size is None else f"give {size} values, one for each frequency"
-    )
-    require(
-        values.ndim == 1 and values.size > 0 and size in (None, values.size),
-        f"{name} shape",
-        values.shape,
-        remedy,
-    )
+    right = values.ndim == 1 and values.size > 0 and size in (None, values.size)
+    wanted = "a list of numbers" if size is None else f"{size} values, one for each frequency"
+    require(right, f"{name} shape", values.shape, f"give {wanted}")
+    wrong = np.flatnonzero(~holds(values))
+    if wrong.size:
+        raise ValueError(f"{name}, entry {wrong[0] + 1}: {values[wrong[0]]:g}: {remedy}")
     return frozen(values)
 
 
-def _require_all(holds: Any, name: str, values: Any, remedy: str) -> None:
-    wrong = np.flatnonzero(~holds)
-    if wrong.size:
-        raise ValueError(f"{name}, entry {wrong[0] + 1}: {values[wrong[0]]:g}: {remedy}")
+def _rises(f: Any) -> Any:
+    return (f > 0) & (np.diff(f, prepend=0.0) > 0) & (f < np.inf)
+
+
+def _is_usable(value: Any) -> Any:
+    return np.isfinite(value) & (value != 0)

@@ -16,16 +16,16 @@ from jaxmuscle._common.text import choices, printable
 from ._frequency_response import COLUMNS, FrequencyResponse
 from ._recording_files import read_table
 from ._recording_table import Table
-from ._text_tables import TEXT, beginning
 
 STIFFNESS = {"n/m": 1.0, "n/cm": 1e2, "n/mm": 1e3, "kn/m": 1e3, "mn/mm": 1.0}
 ROTATION = {"nm/rad": 1.0, "nm/deg": 180 / np.pi, "mnm/rad": 1e-3, "mnm/deg": 0.18 / np.pi}
-UNITS: dict[str, tuple[str, ...]] = {  # of each column, the first being that of a name without unit
-    "frequency": ("hz",),
-    "gain": (*STIFFNESS, *ROTATION, "db"),
-    "phase": ("deg", "rad"),
-    "coherence": ("",),
-    "stderr": (*STIFFNESS, *ROTATION),
+# Of each column, with what one of it is; the first is that of a name without unit.
+UNITS: dict[str, dict[str, float]] = {
+    "frequency": {"hz": 1.0},
+    "gain": STIFFNESS | ROTATION | {"db": 1.0},
+    "phase": {"deg": 1.0, "rad": 180 / np.pi},
+    "coherence": {"": 1.0},
+    "stderr": STIFFNESS | ROTATION,
 }
 FITTED = ("frequency_hz", "real", "imaginary", "stderr")  # of stiffness.csv
 _HEADER = re.compile(
@@ -71,51 +71,26 @@ def load_frequency_response(
     """
     table = read_table(path, 0)
     file = Path(table.file)
-    if {*FITTED} <= {*table.columns}:
-        frequency, real, imaginary, error = (_numbers(table, name, name) for name in FITTED)
-        gain, phase = np.hypot(real, imaginary), np.degrees(np.arctan2(imaginary, real))
-        column, scales = {"frequency": frequency, "stderr": error}, {"stderr": 1.0}
-    else:
-        found = _columns(table)
-        column = {role: _numbers(table, name, role) for role, (name, _) in found.items()}
-        scales = {
-            role: _scale(table, *found[role], lever_arm)
-            for role in ("gain", "stderr")
-            if role in found
-        }
-        gain = (
-            10 ** (column["gain"] / 20)
-            if found["gain"][1] == "db"
-            else column["gain"] * scales["gain"]
-        )
-        phase = np.degrees(column["phase"]) if found["phase"][1] == "rad" else column["phase"]
-    _rising(table, column["frequency"])
-    stderr = None if "stderr" not in column else column["stderr"] * scales["stderr"]
+    words = {
+        "name": printable(file.stem) if name is None else name,
+        "source": printable(file.name) if source is None else source,
+    }
     try:
-        return FrequencyResponse.from_gain(
-            column["frequency"],
-            gain,
-            phase,
-            coherence=column.get("coherence"),
-            segments=segments,
-            stderr=stderr,
-            name=printable(file.stem) if name is None else name,
-            source=printable(file.name) if source is None else source,
-        )
+        if {*FITTED} <= {*table.columns}:
+            frequency, real, imaginary, stderr = (_numbers(table, name, name) for name in FITTED)
+            return FrequencyResponse(frequency, real + 1j * imaginary, stderr, **words)
+        column = {}
+        for role, (heading, unit) in _columns(table).items():
+            column[role] = _numbers(table, heading, role) * UNITS[role][unit]
+            if unit in ROTATION:
+                column[role] /= _lever_arm(lever_arm, f"{heading} is torque over angle") ** 2
+            if unit == "db":
+                column[role] = 10 ** (column[role] / 20)
+        return FrequencyResponse.from_gain(**column, segments=segments, **words)
     except ValueError as error:
-        raise ValueError(f"{table.file}: {_at_its_line(str(error), table)}") from None
-
-
-def is_frequency_response(path: str | os.PathLike[str]) -> bool:
-    """Whether the text at `path` has the columns that `load_frequency_response` reads: frequency,
-    gain and phase, say.
-
-        jm.data.is_frequency_response("response.csv")
-
-    It is read for that.
-    """
-    path = Path(path).expanduser()
-    return path.suffix.lower() in TEXT and path.is_file() and is_response(beginning(path)[1])
+        # the place in the file instead of the number of an entry
+        place = re.sub(r"entry (\d+)", lambda at: table.place(int(at[1]) - 1), str(error))
+        raise ValueError(f"{table.file}: {place}") from None
 
 
 def is_response(names: Iterable[str]) -> bool:
@@ -130,32 +105,27 @@ def is_response(names: Iterable[str]) -> bool:
 def _columns(table: Table) -> dict[str, tuple[str, str]]:
     """Name and unit of the column of each role."""
     found: dict[str, tuple[str, str]] = {}
-    # it takes the gain's unit
+    # the errors come last: without a unit they have that of the gain
     for name in sorted(table.columns, key=lambda name: name.casefold().startswith("stderr")):
         match = _HEADER.fullmatch(name.strip().casefold())
-        role = None if match is None else match[1] if match[1] not in ("freq", "f") else "frequency"
-        if match is None or role is None:
-            raise ValueError(f"{table.file}: unknown column {name!r}; {choices(name, COLUMNS)}")
+        if match is None:
+            raise ValueError(f"unknown column {name!r}; {choices(name, COLUMNS)}")
+        role = "frequency" if match[1] in ("freq", "f") else match[1]
         if role in found:
             raise ValueError(
-                f"{table.file}: the columns {found[role][0]!r} and {name!r} are both the {role};"
-                " keep one"
+                f"the columns {found[role][0]!r} and {name!r} are both the {role}; keep one"
             )
-        unit = "".join(
-            c for c in (match[2] or table.units.get(name, "")).casefold() if c not in " ·*."
-        )
-        unit = unit or (
-            found["gain"][1] if role == "stderr" and "gain" in found else UNITS[role][0]
-        )
+        unit = re.sub(r"[ ·*.]", "", (match[2] or table.units.get(name, "")).casefold())
+        of_gain = role == "stderr" and "gain" in found
+        unit = unit or (found["gain"][1] if of_gain else next(iter(UNITS[role])))
         if unit not in UNITS[role]:
             raise ValueError(
-                f"{table.file}: column {name!r}: unknown unit {unit!r};"
-                f" {choices(unit, UNITS[role])}"
+                f"column {name!r}: unknown unit {unit!r}; {choices(unit, UNITS[role])}"
             )
         found[role] = name, unit
     for role in ("frequency", "gain", "phase"):
         if role not in found:
-            raise ValueError(f"{table.file}: no column {role!r}; expected {', '.join(COLUMNS)}")
+            raise ValueError(f"no column {role!r}; expected {', '.join(COLUMNS)}")
     return found
 
 
@@ -163,33 +133,14 @@ def _numbers(table: Table, name: str, role: str) -> Float[np.ndarray, " rows"]:
     values = table.columns[name]()
     wrong = np.flatnonzero(~np.isfinite(values) & ~((role == "stderr") & (values == np.inf)))
     if wrong.size:
-        where = f"{table.file}, {table.place(int(wrong[0]))}"
         raise ValueError(
-            f"{where}: {name} is missing or not finite; leave the row out if it is not known"
+            f"entry {wrong[0] + 1}: {name} is missing or not finite; leave the row out if it is not"
+            " known"
         )
     return values
 
 
-def _scale(table: Table, name: str, unit: str, lever_arm: float | int | None) -> float:
-    if unit == "db":
-        return 1.0
-    if unit in STIFFNESS:
-        return STIFFNESS[unit]
-    remedy = f"{table.file}: {name} is torque over angle: give the lever arm in m, as lever_arm=0.1"
-    require(lever_arm is not None and 0 < lever_arm < np.inf, "lever_arm", lever_arm, remedy)
-    return ROTATION[unit] / float(lever_arm or 1.0) ** 2
-
-
-def _rising(table: Table, frequency: Float[np.ndarray, " rows"]) -> None:
-    wrong = np.flatnonzero(np.diff(frequency) <= 0)
-    if wrong.size:
-        where = f"{table.file}, {table.place(int(wrong[0]) + 1)}"
-        raise ValueError(
-            f"{where}: frequency {frequency[wrong[0] + 1]:g} Hz does not rise; sort, one row per"
-            " frequency"
-        )
-
-
-def _at_its_line(message: str, table: Table) -> str:
-    """The place in the file instead of the number of an entry."""
-    return re.sub(r"entry (\d+)", lambda entry: table.place(int(entry[1]) - 1), message)
+def _lever_arm(given: float | int | None, what: str) -> float:
+    remedy = f"{what}: give the lever arm in m, as lever_arm=0.1"
+    require(given is not None and 0 < given < np.inf, "lever_arm", given, remedy)
+    return float(given or 1.0)

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from jaxmuscle._common.cards import Card, Shown
-from jaxmuscle._common.text import rounded
+from jaxmuscle._common.text import digits, rounded
 from jaxmuscle.spectra._bin_law import NORMAL, student
 
 RARE = 0.01  # probability of so little scatter
@@ -41,10 +41,17 @@ class Measure(Shown, eqx.Module):
         interval = None if low is None else (low, high)
         return cls(math.nan if value is None else value, error, unit, error_from, interval)
 
+    def times(self, factor: float) -> "Measure":
+        """The number in another scale."""
+        low, high = self.interval or (math.nan, math.nan)
+        interval = None if self.interval is None else (factor * low, factor * high)
+        error = None if self.stderr is None else factor * self.stderr
+        return Measure(factor * self.value, error, self.unit, self.error_from, interval)
+
     def in_words(self) -> str:
         """The value, rounded to its error where it has one."""
         if self.stderr is None:
-            return "none" if math.isnan(self.value) else f"{self.value:.3g}"
+            return "none" if math.isnan(self.value) else digits(self.value)
         return " ± ".join(rounded(self.value, self.stderr))
 
     def interval_in_words(self) -> str:

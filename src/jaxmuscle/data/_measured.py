@@ -2,7 +2,7 @@
 tremor, regularity."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from jaxmuscle._common.text import squared
 from jaxmuscle.spectra._bin_law import ENOUGH, bin_statistics
 from jaxmuscle.spectra._fluctuations import BANDS, dfa, in_bands, variance_spectrum
 from jaxmuscle.spectra._measures import regularity
-from jaxmuscle.spectra._peak_test import bins_around, bins_in, find_peaks, measure_peak
+from jaxmuscle.spectra._peak_test import PeakTest, bins_around, bins_in, find_peaks, measure_peak
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._measure import Measure, log_interval, logit_interval, student_interval
@@ -40,6 +40,8 @@ LEVEL_NAME = "level"
 MEAN, VARIATION, MEDIAN = "mean", "coefficient_of_variation", "median_frequency"
 REGULARITY = ("approximate_entropy", "sample_entropy", "dfa_exponent")
 Measures = dict[str, Measure]
+Times = Float[np.ndarray, " times"]
+Power = Float[np.ndarray, " frequencies"]
 # names of all that is measured of recordings
 MEASURES = (
     MEAN,
@@ -105,54 +107,44 @@ def measure_signals(
     return each, _stated(together, len(signals), sum(map(len, segments)))
 
 
-def _own(
-    x: Float[np.ndarray, " times"],
-    unit: str,
-    quantity: str | None = None,
-    highest: float = math.inf,
-) -> Measures:
+def _own(x: Times, unit: str, quantity: str | None = None, highest: float = math.inf) -> Measures:
     """The measures of one signal but the tremor."""
-    rate = float(RECORDED.rate)
-    f, power = variance_spectrum(x, rate)
-    _, level = variance_spectrum(scipy.signal.detrend(x), rate)
+    f, power = variance_spectrum(x, float(RECORDED.rate))
+    _, level = variance_spectrum(scipy.signal.detrend(x), float(RECORDED.rate))
     mean, variance = float(np.mean(x)), float(np.sum(power))
     sure = float(np.sqrt(np.mean(power[:SLOWEST])))
+    deviation = math.sqrt(variance)
     found = {
         MEAN: _measure(mean, sure, unit),
-        "standard_deviation": _measure(
-            math.sqrt(variance), _error(power) / (2 * math.sqrt(variance)), unit
-        ),
-        VARIATION: _variation(power, mean, sure),
-        f"{VARIATION}_without_drift": _variation(level, mean, sure),
-        f"{VARIATION}_above_{FAST:g}": _variation(power[f >= FAST], mean, sure),
+        "standard_deviation": _measure(deviation, _error(power) / (2 * deviation), unit),
     }
-    if quantity in FLOATING:
-        none = _measure(math.nan, math.nan, "1")
-        found |= {name: none for name in found if name.startswith(VARIATION)}
-    varies, square = math.isfinite(found[VARIATION].value), mean**2
-    relative, shares = {}, {}
+    # about the mean of what floats, nothing varies
+    centre = math.nan if quantity in FLOATING else mean
+    for name, part in (
+        ("", power),
+        ("_without_drift", level),
+        (f"_above_{FAST:g}", power[f >= FAST]),
+    ):
+        found[f"{VARIATION}{name}"] = _variation(part, centre, sure)
+    square = mean**2 if math.isfinite(found[VARIATION].value) else math.nan
+    kinds: dict[str, Measures] = {"power": found, "relative_power": {}, "share": {}}
     for name, (low, high) in RANGES.items():
         inside = (f >= low) & (f < high)
         shown = (high if math.isfinite(high) else low) <= highest
         share = float(np.sum(power[inside])) / variance if shown else math.nan
         within, error = share * variance, _error(power * inside)
-        found[f"power{name}"] = _measure(within, error, squared(unit))
-        relative[f"relative_power{name}"] = (
-            _measure(within / square, math.hypot(error, 2 * within * sure / mean) / square, "1")
-            if varies
-            else _measure(math.nan, math.nan, "1")
-        )
-        shares[f"share{name}"] = _measure(share, _error(power * (inside - share)) / variance, "1")
+        related = math.hypot(error, 2 * within * sure / mean) / square
+        of_share = _error(power * (inside - share)) / variance
+        kinds["power"][f"power{name}"] = _measure(within, error, squared(unit))
+        kinds["relative_power"][f"relative_power{name}"] = _measure(within / square, related, "1")
+        kinds["share"][f"share{name}"] = _measure(share, of_share, "1")
     regular = {}
     whole, *parts = [(*regularity(part), dfa(part)) for part in (x, *np.array_split(x, PARTS))]
     for name, value, each in zip(REGULARITY, whole, zip(*parts, strict=True), strict=True):
-        error = (
-            float(np.std(each, ddof=1)) / math.sqrt(PARTS)
-            if np.all(np.isfinite(each))
-            else math.nan
-        )
-        regular[name] = _measure(value, error, "1", "parts")
-    return found | relative | shares | _median(_segments(x, RECORDED)) | regular
+        regular[name] = _measure(value, _error_of_mean(each), "1", "parts")
+    return (
+        found | kinds["relative_power"] | kinds["share"] | _median(_segments(x, RECORDED)) | regular
+    )
 
 
 def _median(segments: Float[np.ndarray, "segments bins"]) -> Measures:
@@ -176,13 +168,19 @@ def _measure(value: float, error: float, unit: str, error_from: str = "spectrum"
     return Measure(float(value), float(error) if known else None, unit, error_from)
 
 
-def _error(power: Float[np.ndarray, " frequencies"]) -> float:
+def _error_of_mean(values: Sequence[float]) -> float:
+    """By the scatter of the values; NaN where one does not exist."""
+    known = np.all(np.isfinite(values))
+    return float(np.std(values, ddof=1)) / math.sqrt(len(values)) if known else math.nan
+
+
+def _error(power: Power) -> float:
     """Standard error of a sum: an ordinate is s χ²(1), its variance 2 s², and the mean of its
     square 3 s²."""
     return math.sqrt(2 / 3 * float(np.sum(power**2)))
 
 
-def _variation(power: Float[np.ndarray, " frequencies"], mean: float, sure: float) -> Measure:
+def _variation(power: Power, mean: float, sure: float) -> Measure:
     deviation = math.sqrt(float(np.sum(power)))
     if not deviation <= abs(mean):
         return _measure(math.nan, math.nan, "1")
@@ -222,14 +220,14 @@ def _interval(name: str, m: Measure, degrees: int) -> tuple[float, float] | None
 def _together(each: list[Measure]) -> Measure:
     """The mean over the trials; its error from their scatter, or of few trials from their own
     errors."""
-    values, first, count = [m.value for m in each], each[0], len(each)
-    if not np.all(np.isfinite(values)):
-        return _measure(math.nan, math.nan, first.unit, first.error_from)
-    if count >= ENOUGH:
-        error = float(np.std(values, ddof=1)) / math.sqrt(count)
-        return _measure(float(np.mean(values)), error, first.unit, "trials")
-    error = math.hypot(*(math.nan if m.stderr is None else m.stderr for m in each)) / count
-    return _measure(float(np.mean(values)), error, first.unit, first.error_from)
+    first, value = each[0], float(np.mean([m.value for m in each]))
+    if len(each) >= ENOUGH:
+        error = _error_of_mean([m.value for m in each])
+        return _measure(
+            value, error, first.unit, "trials" if math.isfinite(value) else first.error_from
+        )
+    error = math.hypot(*(math.nan if m.stderr is None else m.stderr for m in each)) / len(each)
+    return _measure(value, error, first.unit, first.error_from)
 
 
 def widen_errors(
@@ -277,9 +275,7 @@ def _settings_for_band(band: tuple[float, float], highest: float = math.inf) -> 
     return SpectrumSettings(**AS_RECORDED, first_bin=first, last_bin=max(seen, first))
 
 
-def _segments(
-    x: Float[np.ndarray, " times"], settings: SpectrumSettings
-) -> Float[np.ndarray, "segments bins"]:
+def _segments(x: Times, settings: SpectrumSettings) -> Float[np.ndarray, "segments bins"]:
     """The spectrum of every Welch segment."""
     length, bins = settings.length, slice(settings.first_bin, settings.last_bin + 1)
     _, _, power = scipy.signal.spectrogram(x, settings.rate, "hann", length, length - settings.step)
@@ -299,35 +295,41 @@ def _measure_tremor(
     groups, error_from = (segments, "trials") if many else ([*whole[:, None]], "segments")
     mean, varies = measures[MEAN], math.isfinite(measures[VARIATION].value)
     scale, unit = (1 / abs(mean.value), "1") if varies else (1.0, mean.unit)
+    left_out = (
+        np.mean(np.concatenate(groups[:i] + groups[i + 1 :]), axis=0) for i in range(len(groups))
+    )
+    tested = PeakTest(math.nan, (), math.nan)  # where the band is empty
+    if band[1] > band[0]:
+        tested = find_peaks(np.mean(whole, axis=0), settings, counts, band, LEVEL)
+    return _tremor(
+        tested,
+        (measure_peak(power, settings, counts, band) for power in left_out),
+        math.sqrt(len(groups) - 1),  # of the jackknife
+        lambda power: scale * math.sqrt(power),
+        unit,
+        error_from,
+    )
 
-    if band[1] <= band[0]:
-        none = _measure(math.nan, math.nan, unit, error_from)
-        return {
-            "tremor_p": Measure(math.nan, None, "1", error_from),
-            "tremor_frequency": _measure(math.nan, math.nan, "Hz", error_from),
-            "tremor_size": none,
-            "tremor_detectable": none,
-        }
 
-    def measured(power: Float[np.ndarray, " bins"]) -> tuple[float, float]:
-        frequency, excess = measure_peak(power, settings, counts, band)
-        return frequency, scale * math.sqrt(excess)
-
-    found = find_peaks(np.mean(whole, axis=0), settings, counts, band, LEVEL)
-    values, errors = (math.nan, math.nan), (math.nan, math.nan)
-    if found.peaks:
-        peak = found.peaks[0]
-        values = peak.frequency, scale * math.sqrt(peak.power)
-        left_out = [
-            measured(np.mean(np.concatenate(groups[:i] + groups[i + 1 :]), axis=0))
-            for i in range(len(groups))
-        ]
-        errors = np.sqrt((len(groups) - 1) * np.var(left_out, axis=0))
+def _tremor(
+    tested: PeakTest,
+    again: Iterable[tuple[float, float]],
+    spread: float,
+    size_of: Callable[[float], float],
+    unit: str,
+    error_from: str,
+) -> Measures:
+    """The clearest peak that was found; its errors by so many times the spread of frequency and
+    power when it is measured again, which is done only where there is one."""
+    (frequency, size), errors = (math.nan, math.nan), (math.nan, math.nan)
+    if tested.peaks:
+        frequency, size = tested.peaks[0].frequency, size_of(tested.peaks[0].power)
+        errors = spread * np.std([(f, size_of(power)) for f, power in again], axis=0)
     return {
-        "tremor_p": Measure(found.p, None, "1", error_from),
-        "tremor_frequency": _measure(values[0], float(errors[0]), "Hz", error_from),
-        "tremor_size": _measure(values[1], float(errors[1]), unit, error_from),
-        "tremor_detectable": Measure(scale * math.sqrt(found.detectable), None, unit, error_from),
+        "tremor_p": Measure(tested.p, None, "1", error_from),
+        "tremor_frequency": _measure(frequency, errors[0], "Hz", error_from),
+        "tremor_size": _measure(size, errors[1], unit, error_from),
+        "tremor_detectable": Measure(size_of(tested.detectable), None, unit, error_from),
     }
 
 
@@ -343,74 +345,46 @@ def measure_spectrum(target: Any) -> Measures:
     band, where all bins are there and their segments are known. Its size is √(share of the peak)
     times the coefficient of variation.
     """
-    found = _from_file(target)
-    if not len(target.bins):
-        return _stated(found, len(target.mean or ()), 0)
-    p, settings, f = target.proportional_power, target.settings, target.frequency
-    statistics = bin_statistics(target)
-    covariance = statistics.covariance if statistics.known else np.full(2 * (len(p),), np.nan)
-
-    def share_of(inside: Float[np.ndarray, " bins"]) -> tuple[float, float]:
-        share = float(inside @ p)
-        slope = p * (inside - share)
-        return share, math.sqrt(slope @ covariance @ slope)
-
-    covers = in_bands(f, settings.resolution)
-    for name, (low, high), inside in zip(BANDS, BANDS.values(), covers, strict=True):
-        if np.sum(inside) * settings.resolution >= 0.5 * (high - low):
-            found[f"share{name.removeprefix('band')}"] = _measure(*share_of(inside), "1", "bins")
-    if len(p) < len(settings.frequency):  # some bins are missing
-        return _stated(found, len(target.mean or ()), 0)
-    rows = np.random.default_rng(0).standard_normal((DRAWN, len(p)))
-    drawn = p * np.exp(rows @ _root(covariance).T)
-    error = np.std([median_frequency(row, settings) for row in drawn])
-    found[MEDIAN] = _measure(median_frequency(p, settings), float(error), "Hz", "bins")
-    band = tremor_band(target.quantity)
-    if can_be_tested(target, band):
-        found |= _tremor_of_bins(target, band, drawn)
-    return _stated(found, len(target.mean or ()), 0)
-
-
-def _from_file(target: Any) -> Measures:
-    """Mean and coefficient of variation as a target states them, with the scatter of its trials."""
+    found = {}
     stated = {
         MEAN: (target.mean, target.unit or "a.u."),
         VARIATION: (target.coefficient_of_variation, "1"),
     }
-    found = {}
     for name, (values, unit) in stated.items():
         if values is not None:
-            many = len(values) >= ENOUGH
-            error = float(np.std(values, ddof=1)) / math.sqrt(len(values)) if many else math.nan
+            error = _error_of_mean(values) if len(values) >= ENOUGH else math.nan
             found[name] = _measure(float(np.mean(values)), error, unit, "trials")
+    found |= _of_bins(target) if len(target.bins) else {}
+    return _stated(found, len(target.mean or ()), 0)
+
+
+def _of_bins(target: Any) -> Measures:
+    p, settings, found = target.proportional_power, target.settings, {}
+    statistics = bin_statistics(target)
+    covariance = statistics.covariance if statistics.known else np.full(2 * (len(p),), np.nan)
+    covers = in_bands(target.frequency, settings.resolution)
+    for (name, (low, high)), inside in zip(BANDS.items(), covers, strict=True):
+        if np.sum(inside) * settings.resolution >= 0.5 * (high - low):
+            share = float(inside @ p)
+            slope = p * (inside - share)
+            error = math.sqrt(slope @ covariance @ slope)
+            found[f"share{name.removeprefix('band')}"] = _measure(share, error, "1", "bins")
+    if len(p) < len(settings.frequency):  # some bins are missing
+        return found
+    root = np.linalg.cholesky(covariance) if statistics.known else covariance
+    drawn = p * np.exp(np.random.default_rng(0).standard_normal((DRAWN, len(p))) @ root.T)
+    error = float(np.std([median_frequency(row, settings) for row in drawn]))
+    found[MEDIAN] = _measure(median_frequency(p, settings), error, "Hz", "bins")
+    band = tremor_band(target.quantity)
+    if can_be_tested(target, band):
+        about, varied = (settings, target.segments, band), target.coefficient_of_variation
+        scale = math.nan if varied is None else float(np.mean(varied))
+        found |= _tremor(
+            find_peaks(p, *about, LEVEL),
+            (measure_peak(power / np.sum(power), *about) for power in drawn),
+            1.0,
+            lambda power: scale * math.sqrt(power / settings.resolution),
+            "1",
+            "bins",
+        )
     return found
-
-
-def _root(covariance: Float[np.ndarray, "bins bins"]) -> Float[np.ndarray, "bins bins"]:
-    known = np.all(np.isfinite(covariance))
-    return np.linalg.cholesky(covariance) if known else covariance
-
-
-def _tremor_of_bins(
-    target: Any, band: tuple[float, float], drawn: Float[np.ndarray, "spectra bins"]
-) -> Measures:
-    """The clearest peak of the bins; its errors from spectra that are drawn about them."""
-    p, about = target.proportional_power, (target.settings, target.segments or (), band)
-    varied = target.coefficient_of_variation
-    scale = math.nan if varied is None else float(np.mean(varied))
-
-    def size_of(power: float) -> float:
-        return scale * math.sqrt(power / target.settings.resolution)
-
-    tested = find_peaks(p, *about, LEVEL)
-    values, errors = (math.nan, math.nan), (math.nan, math.nan)
-    if tested.peaks:
-        values = tested.peaks[0].frequency, size_of(tested.peaks[0].power)
-        each = [measure_peak(power / np.sum(power), *about) for power in drawn]
-        errors = np.std([(f, size_of(power)) for f, power in each], axis=0)
-    return {
-        "tremor_p": Measure(tested.p, None, "1", "bins"),
-        "tremor_frequency": _measure(values[0], float(errors[0]), "Hz", "bins"),
-        "tremor_size": _measure(values[1], float(errors[1]), "1", "bins"),
-        "tremor_detectable": Measure(size_of(tested.detectable), None, "1", "bins"),
-    }

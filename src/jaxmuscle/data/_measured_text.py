@@ -2,7 +2,7 @@
 
 import math
 
-from jaxmuscle._common.text import digits, probability, rounded, squared
+from jaxmuscle._common.text import probability, squared
 
 from ._measure import Measure
 from ._measured import FAST, LEVEL_NAME, MEAN, MEDIAN, RANGES, RECORDED, VARIATION, Measures
@@ -84,11 +84,6 @@ def measured_line(words: str, name: str, m: Measure) -> str:
     scale, unit = (
         (100.0, " %") if percent else (1.0, "" if bare else f" {m.unit.replace('^2', '²')}")
     )
-    scale *= 1e6 if name.startswith(RELATIVE) else 1.0
-    said, ends = f"{digits(scale * m.value)}{unit}", ""
-    if math.isnan(m.value):
-        said = "none"
-    if m.stderr is not None and m.interval is not None:
-        said = " ± ".join(rounded(scale * m.value, scale * m.stderr)) + unit
-        ends = " to ".join(rounded(scale * end, scale * m.stderr)[0] for end in m.interval)
-    return f"{words:<{WIDE}}{said:<25} {ends}".rstrip()
+    scaled = m.times(scale * (1e6 if name.startswith(RELATIVE) else 1.0))
+    said = f"{scaled.in_words()}{unit * (not math.isnan(m.value))}"
+    return f"{words:<{WIDE}}{said:<25} {scaled.interval_in_words()}".rstrip()

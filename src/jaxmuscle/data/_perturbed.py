@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 import scipy
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.arguments import require
-from jaxmuscle._common.cards import Printed
+from jaxmuscle._common.arguments import is_real, require
+from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.names import name_of_all
-from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._cross_spectrum import Response, response_of
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -29,7 +28,6 @@ from ._target import Target
 from ._units import scale_to_si
 
 SIGN_FOUND = 4.0  # standard errors from which on the sign of the displacement is found
-UNITS = ("N/m", "N s/m", "kg", "s")
 LEAST_MOVED, MOST_MOVED = 0.005, 100.0  # mm rms: what motors move
 NEGATIVE = (
     "the mean force is negative: count the muscle's pull as positive, or the stiffness has the"
@@ -69,12 +67,16 @@ UNLIKE = (
     " with a fit of the response alone (jaxmuscle fit stiffness.csv)"
 )
 
-Stiffness = Callable[[Float[np.ndarray, " frequencies"]], Complex[np.ndarray, " frequencies"]]
+Times = Float[np.ndarray, " times"]
+Kept = Float[np.ndarray, " kept"]
+Frequencies = Float[np.ndarray, " frequencies"]
+Ordinates = Complex[np.ndarray, " frequencies"]
+Stiffness = Callable[[Frequencies], Ordinates]
 Motion = Float[np.ndarray, "3 times"]
 Reply = Float[np.ndarray, " steps"]
 
 
-class PerturbedRecording(Printed, eqx.Module):
+class PerturbedRecording(Shown, eqx.Module):
     """A recording of two channels: the force of a muscle while its insertion is moved a little.
 
     The displacement counts *lengthening* as positive. The dynamic stiffness H(f) = force /
@@ -113,34 +115,18 @@ class PerturbedRecording(Printed, eqx.Module):
         others: Iterable["PerturbedRecording"] = (),
     ):
         for argument, given, unit in (("force", force, "N"), ("displacement", displacement, "m")):
-            require(
-                isinstance(given, Recording),
-                argument,
-                given,
-                "give a Recording, or use PerturbedRecording.from_array",
-            )
-            remedy = f"give it in {unit}, or use PerturbedRecording.from_array, which converts"
+            instead = "or use PerturbedRecording.from_array"
+            require(isinstance(given, Recording), argument, given, f"give a Recording, {instead}")
+            remedy = f"give it in {unit}, {instead}, which converts"
             require(given.unit == unit, f"{argument}.unit", given.unit, remedy)
         for field in ("rate", "start", "window"):
             same, other = getattr(force, field), getattr(displacement, field)
-            require(
-                same == other,
-                f"displacement.{field}",
-                other,
-                f"that of the force is {same}; give both alike",
-            )
-        sizes = force.whole.size, displacement.whole.size
-        require(
-            sizes[0] == sizes[1],
-            "displacement",
-            f"{sizes[1]} samples",
-            f"the force has {sizes[0]}; give one length",
-        )
+            remedy = f"that of the force is {same}; give both alike"
+            require(same == other, f"displacement.{field}", other, remedy)
+        _check_length(force.whole.size, displacement.whole.size)
         self.force, self.displacement, self.others = force, displacement, tuple(others)
-        self.name, self.source = (
-            force.name if name is None else name,
-            force.source if source is None else source,
-        )
+        self.name = force.name if name is None else name
+        self.source = force.source if source is None else source
         moved = [
             f"displacement: {words}" for words in displacement.notices if words not in force.notices
         ]
@@ -187,66 +173,40 @@ class PerturbedRecording(Printed, eqx.Module):
 
         **Raises:** `ValueError` naming the argument, its value and the remedy.
         """
-        require(
-            positive in (None, "lengthening", "shortening"),
-            "positive",
-            positive,
-            "choose lengthening or shortening",
-        )
+        known = positive in (None, "lengthening", "shortening")
+        require(known, "positive", positive, "choose lengthening or shortening")
         scale, turned = scale_to_si(units, "units", "force", lever_arm)
         reach, swung = scale_to_si(
             displacement_units, "displacement_units", "displacement", lever_arm
         )
         remedy = f"leave it out: {units} and {displacement_units} need none"
         require(lever_arm is None or turned or swung, "lever_arm", lever_arm, remedy)
-        pull, moved = (
-            _signal(name, values)
-            for name, values in (("force", force), ("displacement", displacement))
-        )
-        require(
-            pull.size == moved.size,
-            "displacement",
-            f"{moved.size} samples",
-            f"the force has {pull.size}; give one length",
-        )
-        if np.isfinite(moved).all() and np.ptp(moved) <= 1e-12 * np.max(np.abs(moved), initial=0.0):
+        pull, moved = _signal("force", force), _signal("displacement", displacement)
+        _check_length(pull.size, moved.size)
+        if np.isfinite(moved).all() and _is_constant(moved):
             raise ValueError(
                 f"displacement: constant at {reach * moved[0] + 0.0:g} m, so nothing moved the"
                 " muscle. Take the force alone, as a hold, or choose another column"
             )
         pull, moved, begin, said = _shifted(scale * pull, reach * moved, float(rate), delay)
-        fields: dict[str, Any] = {
-            "name": name,
-            "source": source,
-            "start": float(start) + begin,
-            "window": window,
-        }
-        held, given = (
-            _recording(
-                "force", pull, rate, "N", fields | {"baseline": baseline, "detrend": detrend}
-            ),
-            _recording("displacement", moved, rate, "m", fields),
-        )
-        negative = bool(np.mean(held.whole) < 0)
-        turn, more = _sign(held, given, positive)
-        if negative:
-            more = (
-                [NEGATIVE + NEGATIVE_TURNED] if turn < 0 and positive is None else [NEGATIVE, *more]
-            )
+        start = float(start) + begin
+        words: dict[str, Any] = {"name": name, "source": source, "start": start, "window": window}
+        own = {"unit": "N", "baseline": baseline, "detrend": detrend}
+        pulled = _recording("force", pull, rate, words | own)
+        given = _recording("displacement", moved, rate, words | {"unit": "m"})
+        turn, more = _sign(pulled, given, positive)
+        if np.mean(pulled.whole) < 0:
+            unsure = turn < 0 and positive is None
+            more = [NEGATIVE + NEGATIVE_TURNED] if unsure else [NEGATIVE, *more]
         size = 1e3 * float(np.std(given.whole))
         if not LEAST_MOVED < size < MOST_MOVED:
-            other = "mm" if size > MOST_MOVED else "m"
-            odd = "much" if other == "mm" else "little"
+            odd, other = ("much", "mm") if size > MOST_MOVED else ("little", "m")
             more.append(
                 f"the displacement is {size:.3g} mm rms, which is {odd} for a motor. If its column"
                 f" is in {other}, give --displacement-units {other} (Python: displacement_units=)"
             )
-        return cls(
-            held,
-            _recording("displacement", turn * moved, rate, "m", fields),
-            notices=(*notices, *said, *more),
-            others=others,
-        )
+        lengthening = _recording("displacement", turn * moved, rate, words | {"unit": "m"})
+        return cls(pulled, lengthening, notices=(*notices, *said, *more), others=others)
 
     @property
     def rate(self) -> float:
@@ -271,18 +231,18 @@ class PerturbedRecording(Printed, eqx.Module):
         for part in self.others if window is not None else ():
             if part.force.holds(window):
                 return part.steady(window)
+        force = self.force
         try:
-            held = self.force.steady(window)
+            steady = force.steady(window)
         except ValueError:
             if window is not None:
                 raise
             found = self._without_answer().steady()  # or it raises the same
-            alone = self.force._with(self.force.whole, self.rate, None, found.notices)
-            held = alone.steady(found.window)
-        moved = self.displacement.steady("all" if held.window is None else held.window)
-        return PerturbedRecording(
-            held, moved, name=self.name, source=self.source, notices=self.notices
-        )
+            alone = force._with(window=None, notices=found.notices)
+            steady = alone.steady(found.window)
+        moved = self.displacement.steady("all" if steady.window is None else steady.window)
+        words = {"name": self.name, "source": self.source, "notices": self.notices}
+        return PerturbedRecording(steady, moved, **words)
 
     def _without_answer(self) -> Recording:
         """The force less `K x + B x' + I x''` of the displacement, by least squares over all of the
@@ -292,9 +252,7 @@ class PerturbedRecording(Printed, eqx.Module):
         columns = np.stack([np.ones_like(x), x, speed, np.gradient(speed, 1 / self.rate)], axis=1)
         columns /= np.linalg.norm(columns, axis=0)
         sizes = np.linalg.lstsq(columns, self.force.whole, rcond=None)[0]
-        return self.force._with(
-            self.force.whole - columns[:, 1:] @ sizes[1:], self.rate, None, self.force.notices
-        )
+        return self.force._with(samples=self.force.whole - columns[:, 1:] @ sizes[1:], window=None)
 
     def frequency_response(
         self, settings: SpectrumSettings | str | None = None
@@ -339,25 +297,20 @@ class PerturbedRecording(Printed, eqx.Module):
 
         **Source:** Kearney & Hunter 1990, Crit Rev Biomed Eng 18(1):55-87.
         """
-        found = self._second_order(settings, False)
-        rows = zip("KBI", found.value, found.stderr, UNITS, strict=False)
-        return {
-            name: Measure(
-                float(value),
-                float(error),
-                unit,
-                "spectrum",
-                normal_interval(float(value), float(error)),
-            )
-            for name, value, error, unit in rows
-        }
+        value, stderr, _ = self._second_order(settings)
+        rows = zip(value.tolist(), stderr.tolist(), ("N/m", "N s/m", "kg"), strict=True)
+        measures = (
+            Measure(number, error, unit, "spectrum", normal_interval(number, error))
+            for number, error, unit in rows
+        )
+        return dict(zip("KBI", measures, strict=True))
 
     def second_order_misfit(self, settings: SpectrumSettings | str | None = None) -> float:
         """How many times as large as expected chi² of `second_order` is: about 1 where that is the
         shape of the response."""
-        return self._second_order(settings, False).chi2
+        return self._second_order(settings).chi2
 
-    def _second_order(self, settings: SpectrumSettings | str | None, delayed: bool) -> SecondOrder:
+    def _second_order(self, settings: Any, *, delayed: bool = False) -> SecondOrder:
         return second_order_fit(self._response(settings), delayed)
 
     def delay(self, settings: SpectrumSettings | str | None = None) -> tuple[float, float]:
@@ -375,7 +328,7 @@ class PerturbedRecording(Printed, eqx.Module):
 
         **Returns:** τ and its standard error; positive if the force comes later.
         """
-        found = self._second_order(settings, True)
+        found = self._second_order(settings, delayed=True)
         return float(found.value[3]), float(found.stderr[3])
 
     def late(self, settings: SpectrumSettings | str | None = None) -> list[str]:
@@ -392,10 +345,7 @@ class PerturbedRecording(Printed, eqx.Module):
         self,
         name: str | None = None,
         *,
-        stiffness: (
-            Callable[[Float[np.ndarray, " frequencies"]], Complex[np.ndarray, " frequencies"]]
-            | None
-        ) = None,
+        stiffness: Stiffness | None = None,
         provenance: str = "measured",
         settings: SpectrumSettings | str | None = None,
     ) -> Target:
@@ -420,32 +370,21 @@ class PerturbedRecording(Printed, eqx.Module):
         returns the figure."""
         return plot.perturbed(self, settings, ax)
 
-    def __str__(self) -> str:
-        force, moved = self.force, self.displacement
-        lines = [
-            (
-                f"{self.name}: force [N] and lengthening [m], {force.whole.size} samples at"
-                f" {self.rate:g} Hz"
-            ),
-            f"  source    {self.source}",
-            f"  time      {force.start:g} s to {force.stop:g} s; {force.window_in_words}",
-            (
-                f"  force     mean {np.mean(force.samples):.4g} N, standard deviation"
-                f" {np.std(force.samples):.3g} N"
-            ),
-            (
-                f"  displaced {1e3 * np.std(moved.samples):.3g} mm rms, at most"
-                f" {1e3 * _largest(moved.samples):.3g} mm"
-            ),
+    def _card(self) -> Card:
+        force, pull, moved = self.force, self.force.samples, self.displacement.samples
+        largest = np.max(np.abs(moved - np.mean(moved)))
+        known = [
+            ("source", self.source),
+            ("time", f"{force.start:g} s to {force.stop:g} s; {force.window_in_words}"),
+            ("force", f"mean {np.mean(pull):.4g} N, standard deviation {np.std(pull):.3g} N"),
+            ("moved", f"{1e3 * np.std(moved):.3g} mm rms, at most {1e3 * largest:.3g} mm"),
+            *(("notice", notice) for notice in self.notices),
         ]
-        return folded(lines + [f"  notice    {notice}" for notice in self.notices])
+        size = f"{force.whole.size} samples at {self.rate:g} Hz"
+        return facts(f"{self.name}: force [N] and lengthening [m], {size}", known)
 
 
-def _largest(x: Float[np.ndarray, " times"]) -> float:
-    return float(np.max(np.abs(x - np.mean(x))))
-
-
-def _signal(name: str, values: Any) -> Float[np.ndarray, " times"]:
+def _signal(name: str, values: Any) -> Times:
     try:
         signal = np.array(values, dtype=float)
     except (TypeError, ValueError):
@@ -454,28 +393,29 @@ def _signal(name: str, values: Any) -> Float[np.ndarray, " times"]:
     return signal
 
 
-def _recording(
-    kind: str, samples: Any, rate: float | int, unit: str, fields: dict[str, Any]
-) -> Recording:
+def _check_length(force: int, moved: int) -> None:
+    remedy = f"the force has {force}; give one length"
+    require(force == moved, "displacement", f"{moved} samples", remedy)
+
+
+def _is_constant(x: Times) -> bool:
+    return bool(np.ptp(x) <= 1e-12 * np.max(np.abs(x), initial=0.0))
+
+
+def _recording(kind: str, samples: Times, rate: float | int, words: dict[str, Any]) -> Recording:
     try:
-        return Recording(samples, rate, unit=unit, **fields)
+        return Recording(samples, rate, **words)
     except ValueError as error:
         raise ValueError(f"{kind}: {error}") from None
 
 
 def _shifted(
-    force: Float[np.ndarray, " times"], moved: Float[np.ndarray, " times"], rate: float, delay: Any
-) -> tuple[Float[np.ndarray, " kept"], Float[np.ndarray, " kept"], float, list[str]]:
+    force: Times, moved: Times, rate: float, delay: Any
+) -> tuple[Kept, Kept, float, list[str]]:
     """Both channels with the displacement later by `delay` [s] (a spline of order 5), the time of
     the first, a notice."""
-    longest = force.size / 2 / rate
-    number = isinstance(delay, int | float | np.number) and not isinstance(delay, bool)
-    require(
-        number and abs(delay) < longest,
-        "delay",
-        delay,
-        "give a time in s, shorter than half of the recording",
-    )
+    short = is_real(delay) and abs(delay) < force.size / 2 / rate
+    require(short, "delay", delay, "give a time in s, shorter than half of the recording")
     if not delay:
         return force, moved, 0.0, []
     at = np.arange(force.size) - float(delay) * rate
@@ -490,7 +430,7 @@ def _response(force: Recording, displacement: Recording, settings: SpectrumSetti
     remedy = f"half of it lies below the last bin, {highest:g} Hz; choose a lower last_bin"
     require(highest < force.rate / 2, "rate", force.rate, remedy)
     given = displacement.filtered(settings)
-    if np.ptp(given) <= 1e-12 * np.max(np.abs(given)):
+    if _is_constant(given):
         raise ValueError(
             f"{displacement.name}: the displacement is constant in the window; choose another"
             " window"
@@ -526,22 +466,21 @@ class _Moved(NamedTuple):
     nonlinear muscle (nothing where that is unknown).
     """
 
-    force: Float[np.ndarray, " all"]
-    length: Float[np.ndarray, " all"]
-    reply: Float[np.ndarray, " all"]
-    bend: Float[np.ndarray, " all"]
+    force: Times
+    length: Times
+    reply: Times
+    bend: Times
     exact: bool
     inside: slice
 
+    def transform(self, x: Times) -> Ordinates:
+        """Of what lies in the window, tapered."""
+        here = x[self.inside] - np.mean(x[self.inside])
+        return np.fft.rfft(scipy.signal.windows.tukey(len(here), TAPER) * here)
 
-class _Ordinates(NamedTuple):
-    """The transforms of one recording in its window: lengthening, what is left of the force, and
-    all of what is left."""
-
-    f: Float[np.ndarray, " ordinates"]
-    length: Complex[np.ndarray, " ordinates"]
-    rest: Complex[np.ndarray, " ordinates"]
-    fluctuation: Recording
+    def frequency(self, rate: float) -> Frequencies:
+        """Of the ordinates [Hz]."""
+        return np.fft.rfftfreq(self.inside.stop - self.inside.start, 1 / rate)
 
 
 def perturbed_target(
@@ -583,27 +522,27 @@ def perturbed_target(
     """
     settings = recorded_settings(settings)
     each = [
-        _measured(recording, settings) if stiffness is None else stiffness
+        _nonparametric(recording, settings) if stiffness is None else stiffness
         for recording in recordings
     ]
     moved = [
-        _moved(recording, own, predicted, settings)
+        _moved(recording, own, predicted, settings.rate)
         for recording, own in zip(recordings, each, strict=True)
     ]
     share, said = _share_shown(moved, settings) if predicted is not None else (1.0, ())
     pieces = [
-        _ordinates(*pair, share, said, settings) for pair in zip(recordings, moved, strict=True)
+        _fluctuation(*pair, share, said, settings.rate)
+        for pair in zip(recordings, moved, strict=True)
     ]
-    fluctuations = [piece.fluctuation for piece in pieces]
-    called = name_of_all([recording.name for recording in recordings]) if name is None else name
-    target = pooled_target(fluctuations, called, "force", provenance, None, settings)
-    return target.with_stiffness(
-        _pooled(pieces, each[0], called, target.source, float(settings.frequency[-1]))
-    )
+    name = name_of_all([recording.name for recording in recordings]) if name is None else name
+    target = pooled_target(pieces, name, "force", provenance, None, settings)
+    response = _pooled(moved, pieces, each[0], settings)
+    words = {"name": name, "source": target.source}
+    return target.with_stiffness(FrequencyResponse(*response, **words))
 
 
-def _measured(recording: PerturbedRecording, settings: SpectrumSettings) -> Stiffness:
-    """The nonparametric response, held beyond its ends; what makes no odds since nothing moves
+def _nonparametric(recording: PerturbedRecording, settings: SpectrumSettings) -> Stiffness:
+    """The response that was measured, held beyond its ends: that makes no odds, since nothing moves
     there."""
     found = recording.frequency_response(settings)
     return lambda f: (
@@ -612,31 +551,18 @@ def _measured(recording: PerturbedRecording, settings: SpectrumSettings) -> Stif
     )
 
 
-def _even(recording: Recording, rate: float) -> tuple[Float[np.ndarray, " all"], slice]:
-    even, margin = recording.resampled(rate), round(MARGIN * rate)
-    first, stop = recording.span(rate)
-    span = max(first, margin), min(stop, even.whole.size - margin)
-    require(
-        span[1] - span[0] > 4 * margin,
-        "window",
-        recording.window,
-        f"holds less than {4 * MARGIN:g} s besides {MARGIN:g} s before and after it; record longer",
-    )
-    return even.whole, slice(*span)
-
-
 def _moved(
-    recording: Any, stiffness: Stiffness, predicted: Any, settings: SpectrumSettings
+    recording: PerturbedRecording, stiffness: Stiffness, predicted: Any, rate: float
 ) -> _Moved:
-    force, inside = _even(recording.force, settings.rate)
-    moved, _ = _even(recording.displacement, settings.rate)
-    length = moved - np.mean(moved[inside])
-    return _Moved(force, length, *_reply(length, stiffness, predicted, settings.rate), inside)
-
-
-def _transformed(x: Float[np.ndarray, " all"], inside: slice) -> Complex[np.ndarray, " ordinates"]:
-    here = x[inside] - np.mean(x[inside])
-    return np.fft.rfft(scipy.signal.windows.tukey(len(here), TAPER) * here)
+    force, moved = (x.resampled(rate).whole for x in (recording.force, recording.displacement))
+    margin, (first, stop) = round(MARGIN * rate), recording.force.span(rate)
+    first, stop = max(first, margin), min(stop, force.size - margin)
+    remedy = (
+        f"holds less than {4 * MARGIN:g} s besides {MARGIN:g} s before and after it; record longer"
+    )
+    require(stop - first > 4 * margin, "window", recording.window, remedy)
+    length = moved - np.mean(moved[first:stop])
+    return _Moved(force, length, *_reply(length, stiffness, predicted, rate), slice(first, stop))
 
 
 def _share_shown(moved: list[_Moved], settings: SpectrumSettings) -> tuple[float, tuple[str, ...]]:
@@ -653,84 +579,57 @@ def _share_shown(moved: list[_Moved], settings: SpectrumSettings) -> tuple[float
     """
     shown = weight = 0.0
     for one in moved:
-        length, rest, bend = (
-            _transformed(x, one.inside) for x in (one.length, one.force - one.reply, one.bend)
-        )
-        f = np.fft.rfftfreq(one.inside.stop - one.inside.start, 1 / settings.rate)
-        density = _smooth(f, np.abs(rest) ** 2)
-        edges = _groups(_lowest([f]), float(settings.frequency[-1]))
-        group = np.digitize(f, edges) - 1
-        used = (group >= 0) & (group < len(edges) - 1)
-        length, rest, bend, density, group = (
-            length[used],
-            rest[used],
-            bend[used],
-            density[used],
-            group[used],
-        )
-        own = np.zeros((3, len(edges) - 1), complex)
-        for row, x in zip(own, (length, rest, bend), strict=True):
-            np.add.at(row, group, np.conj(length) * x / density)
-        rest, bend = (
-            x - length * (row[group] / np.maximum(np.real(own[0][group]), 1e-300))
-            for x, row in ((rest, own[1]), (bend, own[2]))
-        )
-        shown += float(np.sum(np.real(np.conj(bend) * rest) / density))
-        weight += float(np.sum(np.abs(bend) ** 2 / density))
+        f = one.frequency(settings.rate)
+        signals = (one.length, one.force - one.reply, one.bend)
+        length, *others = (one.transform(x) for x in signals)
+        density = _smooth(f, np.abs(others[0]) ** 2)
+        grouped = _grouped(f, _groups([f], settings))
+        sums = (grouped / density) @ (np.conj(length) * [length, *others]).T
+        # a linear response that is somewhat wrong would be taken for a share of the nonlinear one
+        slopes = sums[:, 1:] / np.maximum(np.real(sums[:, :1]), 1e-300)
+        rest, bend = others - length * (slopes.T @ grouped)
+        inverse = grouped.any(axis=0) / density
+        shown += float(np.real(np.conj(bend) * rest) @ inverse)
+        weight += float(np.abs(bend) ** 2 @ inverse)
     if weight <= 0:
         return 1.0, ()
     share, error = shown / weight, 1 / np.sqrt(2 * weight)
     if abs(share - 1) <= FROM_ALL * error:
         return 1.0, ()
     size = np.sqrt(np.mean(np.concatenate([one.bend[one.inside] for one in moved]) ** 2))
-    none = abs(share) <= FROM_NONE * error
-    words = UNLIKE.format(
-        "less" if share < 1 else "more",
-        size,
-        100 * share,
-        100 * error,
-        "none of it" if none else "that share",
-    )
-    return 0.0 if none else share, (words,) * (abs(share - 1) > DIFFERENT)
+    which, taken = "less" if share < 1 else "more", "that share"
+    words = UNLIKE.format(which, size, 100 * share, 100 * error, taken)
+    if abs(share) <= FROM_NONE * error:
+        words, share = UNLIKE.format(which, size, 100 * share, 100 * error, "none of it"), 0.0
+    return share, (words,) * (abs(share - 1) > DIFFERENT)
 
 
-def _ordinates(
-    recording: Any, moved: _Moved, share: float, said: tuple[str, ...], settings: SpectrumSettings
-) -> _Ordinates:
-    rate, inside = settings.rate, moved.inside
-    left = moved.force - moved.reply - share * moved.bend
-    edges = (
-        recording.force.start + inside.start / rate,
-        recording.force.start + inside.stop / rate,
+def _fluctuation(
+    recording: PerturbedRecording, moved: _Moved, share: float, said: tuple[str, ...], rate: float
+) -> Recording:
+    """What is left of the force without its response."""
+    start = recording.force.start
+    ends, asked = (
+        tuple(start + end / rate for end in pair)
+        for pair in ((moved.inside.start, moved.inside.stop), recording.force.span(rate))
     )
-    asked = tuple(recording.force.start + edge / rate for edge in recording.force.span(rate))
-    cut = (
-        ()
-        if max(abs(a - b) for a, b in zip(asked, edges, strict=True)) < CUT
-        else (SHORTER.format(*asked, *edges, MARGIN),)
-    )
-    linear = () if moved.exact else (LINEAR,)
-    fluctuation = Recording(
-        left,
-        rate,
-        unit=recording.force.unit,
+    cut = max(abs(a - b) for a, b in zip(asked, ends, strict=True)) >= CUT
+    notices = (*recording.notices, *recording.late())
+    notices += (SHORTER.format(*asked, *ends, MARGIN),) * cut + (LINEAR,) * (not moved.exact) + said
+    return recording.force._with(
+        samples=moved.force - moved.reply - share * moved.bend,
+        rate=rate,
+        window=ends,
+        notices=notices,
         name=recording.name,
         source=recording.source,
-        start=recording.force.start,
-        window=edges,
-        baseline="none",
-        notices=(*recording.notices, *recording.late(), *cut, *linear, *said),
-        recorded_at=recording.force.recorded_at,
-    )
-    f = np.fft.rfftfreq(inside.stop - inside.start, 1 / rate)
-    return _Ordinates(
-        f, _transformed(moved.length, inside), _transformed(fluctuation.whole, inside), fluctuation
+        detrend=False,
     )
 
 
 def _reply(
-    length: Float[np.ndarray, " all"], stiffness: Stiffness, predicted: Any, rate: float
-) -> tuple[Float[np.ndarray, " all"], Float[np.ndarray, " all"], bool]:
+    length: Times, stiffness: Stiffness, predicted: Any, rate: float
+) -> tuple[Times, Times, bool]:
     """What the force does when it follows the lengthening linearly, right from the margin on; by
     how much `predicted` differs; and whether that is known."""
     edge = round(0.5 * MARGIN * rate)
@@ -742,12 +641,11 @@ def _reply(
     where, density = scipy.signal.welch(tapered, rate, nperseg=min(1024, len(length)))
     excited = np.interp(f, where, density) >= EXCITED * np.max(density)
     moved = np.where(excited, np.fft.rfft(tapered), 0.0)
+    # the stiffness costs a solution of the model for each frequency, and is smooth: at nodes that
+    # are close together where it bends most, with splines between them
     nodes = np.sinh(np.linspace(0.0, 6.0, NODES)) / np.sinh(6.0) * rate / 2
-    value = stiffness(nodes)
-    smooth = scipy.interpolate.CubicSpline(
-        nodes, np.stack([np.real(value), np.imag(value)]), axis=1
-    )(f)
-    reply = np.fft.irfft((smooth[0] + 1j * smooth[1]) * moved, len(length))
+    smooth = scipy.interpolate.CubicSpline(nodes, stiffness(nodes))(f)
+    reply = np.fft.irfft(smooth * moved, len(length))
     if predicted is not None:
         fine, turn = HALF_STEPS * len(length), 2j * np.pi * f
         motion = np.stack(
@@ -760,50 +658,44 @@ def _reply(
     return reply, np.zeros_like(reply), predicted is None
 
 
-def _lowest(each: list[Float[np.ndarray, " ordinates"]]) -> float:
-    return max(LOWEST, LEAST_PERIODS * max(float(f[1]) for f in each))
-
-
-def _groups(lowest: float, highest: float) -> Float[np.ndarray, " edges"]:
+def _groups(each: list[Frequencies], settings: SpectrumSettings) -> Float[np.ndarray, " edges"]:
+    """Edges of groups of frequencies, from where every window holds some periods on."""
+    lowest = max(LOWEST, LEAST_PERIODS * max(float(f[1]) for f in each))
     edges = [LOWEST]
-    while edges[-1] < highest:
+    while edges[-1] < settings.frequency[-1]:
         edges.append(edges[-1] + np.clip(WIDTH * edges[-1], NARROWEST, WIDEST))
     return np.array([edge for edge in edges if edge >= lowest])
 
 
+def _grouped(
+    f: Frequencies, edges: Float[np.ndarray, " edges"]
+) -> Bool[np.ndarray, "groups ordinates"]:
+    """Which ordinates belong to which group."""
+    return np.digitize(f, edges) - 1 == np.arange(len(edges) - 1)[:, None]
+
+
 def _pooled(
-    pieces: list[_Ordinates], stiffness: Stiffness, name: str, source: str, highest: float
-) -> FrequencyResponse:
+    moved: list[_Moved], pieces: list[Recording], stiffness: Stiffness, settings: SpectrumSettings
+) -> tuple[Frequencies, Ordinates, Frequencies]:
     """The stiffness in groups of frequencies, those of all trials together with weights by their
-    errors."""
-    edges = _groups(_lowest([piece.f for piece in pieces]), highest)
-    weight, change, middle = (np.zeros(len(edges) - 1, dtype) for dtype in (float, complex, float))
-    for piece in pieces:
-        group = np.digitize(piece.f, edges) - 1
-        used = (group >= 0) & (group < len(weight))
-        square = np.abs(piece.length) ** 2
-        density = _smooth(piece.f, np.abs(piece.rest) ** 2)
-        for values, each in (
-            (weight, square / density),
-            (change, np.conj(piece.length) * piece.rest / density),
-            (middle, piece.f * square / density),
-        ):
-            np.add.at(values, group[used], each[used])
-    kept = weight > 0
-    weight, change, middle = weight[kept], change[kept], middle[kept]
-    frequency = middle / weight
-    return FrequencyResponse(
-        frequency,
-        stiffness(frequency) + change / weight,
-        1 / np.sqrt(2 * weight),
-        name=name,
-        source=source,
-    )
+    errors: frequencies, values and standard errors."""
+    edges = _groups([one.frequency(settings.rate) for one in moved], settings)
+    sums = np.zeros((len(edges) - 1, 3), complex)
+    for one, piece in zip(moved, pieces, strict=True):
+        f, length, rest = (
+            one.frequency(settings.rate),
+            one.transform(one.length),
+            one.transform(piece.whole),
+        )
+        square = np.abs(length) ** 2
+        columns = np.stack([square, np.conj(length) * rest, f * square], axis=1)
+        sums += _grouped(f, edges) / _smooth(f, np.abs(rest) ** 2) @ columns
+    weight, change, middle = sums[np.real(sums[:, 0]) > 0].T
+    weight, frequency = np.real(weight), np.real(middle / weight)
+    return frequency, stiffness(frequency) + change / weight, 1 / np.sqrt(2 * weight)
 
 
-def _smooth(
-    f: Float[np.ndarray, " ordinates"], power: Float[np.ndarray, " ordinates"]
-) -> Float[np.ndarray, " ordinates"]:
+def _smooth(f: Frequencies, power: Frequencies) -> Frequencies:
     """Mean power over a quarter of each frequency to both sides, at least 0.1 Hz; without the
     mean's."""
     reach = np.maximum(np.rint(np.maximum(AROUND * f, FEWEST) / f[1]).astype(int), 3)

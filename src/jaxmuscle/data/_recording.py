@@ -1,10 +1,11 @@
 """Recordings: what was measured (force, torque, motion), its steady part, its spectra, and the
 target it gives."""
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
-from typing import Any, get_args
+from typing import Any, Unpack, get_args
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.arguments import require
+from jaxmuscle._common.arguments import is_real, require
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._measures import peaks, regularity
@@ -21,7 +22,7 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
 from ._measured import AS_RECORDED, FLOATING, MOTIONS, RECORDED, measure_signals
-from ._recording_choice import Reading, recording_of
+from ._recording_choice import Reading, ReadingOptions, recording_of
 from ._recording_outliers import OUTLIERS, OUTSIDE, Burst, find_bursts
 from ._recording_quality import (
     AT_REST,
@@ -42,7 +43,6 @@ from ._units import UNITS, known_unit
 LOWEST_RATE = 10.0  # Hz; half of it lies above what is slow in a force
 SEGMENTS = 2  # a steady part holds at least this many
 SHORTEST = (RECORDED.length + (SEGMENTS - 1) * RECORDED.step) / RECORDED.rate  # s, which these take
-QUANTITIES = tuple(dict.fromkeys(quantity for quantity in UNITS.values() if quantity))
 DRIFT = 0.5  # share of the variance
 UNLIKE = 1.1  # ratio of the means of two trials
 UNRAMPED = "steady part: no ramp found, so all of the recording is used"
@@ -117,12 +117,12 @@ class Recording(Shown, eqx.Module):
         spelled = known_unit(unit)
         require(spelled is not None, "unit", unit, choices(unit, UNITS))
         self.unit, self.detrend = str(spelled), detrend
-        measured, known = UNITS[self.unit], choices(str(quantity), QUANTITIES)
-        require(quantity in UNITS.values(), "quantity", quantity, known)
-        remedy = f"the unit {unit} is that of another quantity ({measured}); give `units`"
-        fits = None in (quantity, measured) or quantity == measured
-        require(fits, "quantity", quantity, remedy)
-        self.quantity = measured or quantity
+        known = tuple(dict.fromkeys(filter(None, UNITS.values())))
+        remedy = choices(quantity, known)
+        require(quantity in (None, *known), "quantity", quantity, remedy)
+        self.quantity = UNITS[self.unit] or quantity
+        remedy = f"the unit {unit} is that of another quantity ({self.quantity}); give `units`"
+        require(quantity in (None, self.quantity), "quantity", quantity, remedy)
         given = checked(samples, self.rate, self.start)
         self.others, notices = tuple(others), tuple(notices)
         if baseline is None and self.quantity in MOTIONS:
@@ -137,97 +137,19 @@ class Recording(Shown, eqx.Module):
         self.window = None if window is None else self._checked(window)
 
     @classmethod
-    def from_dataframe(  # noqa: PLR0913 (options of a public call)
-        cls,
-        frame: Any,
-        *,
-        column: str | int | None = None,
-        rate: float | int | None = None,
-        units: str | None = None,
-        axis: str | None = None,
-        reference: str | int | None = None,
-        time: str | int | None = None,
-        max_gap: float | int = 0.2,
-        lever_arm: float | int | None = None,
-        outliers: str = "keep",
-        quantity: str | None = None,
-        baseline: Baseline = None,
-        detrend: bool = False,
-        name: str = "recording",
+    def from_dataframe(
+        cls, frame: Any, *, name: str = "recording", **options: Unpack[ReadingOptions]
     ) -> "Recording":
         """A recording from a pandas table, by the rules for tables in files.
 
         **Arguments:** `frame`, a `pandas.DataFrame`. Its times are a column, or the index: numbers
-        in s, a `DatetimeIndex` or a `TimedeltaIndex`. `name` as in `Recording`; the others as in
-        `load_recording`.
+        in s, a `DatetimeIndex` or a `TimedeltaIndex`. `name` as in `Recording`; the `options` are
+        those of `load_recording` for one column: `column`, `rate`, `units`, `axis`, `reference`,
+        `time`, `max_gap`, `lever_arm`, `outliers`, `quantity`, `baseline`, `detrend`.
 
         **Raises:** `ValueError` naming column, row or argument, and the remedy.
         """
-        reading = Reading(
-            column,
-            rate,
-            units,
-            axis,
-            reference,
-            time,
-            max_gap,
-            lever_arm,
-            outliers,
-            quantity,
-            baseline,
-            detrend,
-        )
-        return recording_of(cls, frame_table(frame), reading, name)
-
-    @classmethod
-    def from_array(  # noqa: PLR0913 (options of a public call)
-        cls,
-        samples: Any,
-        rate: float | int,
-        *,
-        column: int = 0,
-        unit: str = "N",
-        quantity: str | None = None,
-        baseline: Baseline = None,
-        detrend: bool = False,
-        name: str = "recording",
-        source: str = "given by the user",
-        start: float | int = 0.0,
-        window: Sequence[float | int] | None = None,
-        notices: Iterable[str] = (),
-    ) -> "Recording":
-        """A recording from an array: one signal, or a column of several.
-
-        **Arguments:**
-
-        - `samples`: shape `(times,)` or `(times, columns)`
-        - `rate` [Hz]
-        - `column`: counted from 0; the others as in `Recording`
-
-        **Raises:** `ValueError` for a column that is not there, and as `Recording` does.
-        """
-        array = np.asarray(samples)
-        if array.ndim == 2:
-            require(
-                0 <= column < array.shape[1],
-                "column",
-                column,
-                f"give a number from 0 to {array.shape[1] - 1}",
-            )
-            array = array[:, column]
-        return cls(
-            array,
-            rate,
-            unit=unit,
-            quantity=quantity,
-            baseline=baseline,
-            detrend=detrend,
-            name=name,
-            source=source,
-            start=start,
-            window=window,
-            notices=notices,
-        )
+        return recording_of(cls, frame_table(frame), Reading(**options), name)
 
     def _checked(self, window: Any) -> tuple[float, float]:
         try:
@@ -258,12 +180,24 @@ class Recording(Shown, eqx.Module):
         a, b = (self.start, self.stop) if self.window is None else self.window
         return max(round((a - self.start) * rate), 0), round((b - self.start) * rate)
 
-    def _with(
-        self, samples: Any, rate: float, window: Any, notices: Iterable[str], **changed: Any
-    ) -> "Recording":
-        kept = ("unit", "quantity", "detrend", "name", "source", "start", "recorded_at")
-        fields = {key: getattr(self, key) for key in kept} | changed
-        return Recording(samples, rate, **fields, baseline="none", window=window, notices=notices)
+    def _with(self, **changed: Any) -> "Recording":
+        """The recording with other arguments; its level at rest is subtracted already."""
+        kept = (
+            *(
+                "rate",
+                "unit",
+                "quantity",
+                "detrend",
+                "name",
+                "source",
+                "start",
+                "window",
+                "notices",
+            ),
+            "recorded_at",
+        )
+        fields: dict[str, Any] = {"samples": self.whole, "baseline": "none"}
+        return Recording(**fields | {key: getattr(self, key) for key in kept} | changed)
 
     @property
     def stop(self) -> float:
@@ -309,7 +243,7 @@ class Recording(Shown, eqx.Module):
         samples = scipy.signal.resample_poly(
             self.whole, ratio.numerator, ratio.denominator, padtype="line"
         )
-        return self._with(samples, rate, self.window, self.notices)
+        return self._with(samples=samples, rate=rate)
 
     def steady(self, window: Sequence[float | int] | str | None = None) -> "Recording":
         """The recording with its steady part as window: the one that is given, or the plateau of a
@@ -333,51 +267,42 @@ class Recording(Shown, eqx.Module):
         """
         if isinstance(window, str) and window == "all":
             return self._straight()
-        for part in self.others if window is not None else ():
-            if part.holds(window):
-                return part.steady(window)
-        if window is not None:
-            self._checked(window)
-        notices, found = self.notices, None
         if window is None:
-            even = self.resampled(RECORDED.rate)
-            everything = (0, even.whole.size)
-            rest = None if self.quantity in FLOATING else find_rest(even.whole, even.rate)
-            above = even.whole - (rest.level if rest is not None and rest.quiet else 0.0)
-            found = everything if self.quantity in FLOATING else plateau(above, even.rate)
-            if found is None:
-                resting = "".join(f". {said}" for said in notices if said.startswith(AT_REST))
-                raise ValueError(
-                    f"{self.name}: no steady part was found: the signal must stay within 10 % of"
-                    " one level for at least half of the time under load, and longer than 2 s. Is"
-                    " it the right column? Then give the part yourself: --window a:b (in Python"
-                    f" steady((a, b))), between {self.start:g} and {self.stop:g} s" + resting
-                )
-            window = (
-                self.start + found[0] / even.rate,
-                min(self.start + found[1] / even.rate, self.stop),
+            part = self._hold()
+            what = f"its steady part of {part.duration:.3g} s"
+        else:
+            for part in self.others:
+                if part.holds(window):
+                    return part.steady(window)
+            part = self._with(window=self._checked(window))
+            what = f"window={part.window!r}"
+        count = part.segments()
+        if count < SEGMENTS:
+            raise ValueError(
+                f"{self.name}: {what} holds {count} of the {SEGMENTS} Welch segments needed; give"
+                f" at least {SHORTEST:g} s"
             )
-            notices = (
-                *notices,
-                (
-                    UNRAMPED
-                    if found == everything
-                    else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s"
-                ),
-            )
-        part = self._with(self.whole, self.rate, window, notices)
-        if (held := part.segments()) < SEGMENTS:
-            what = (
-                f"window={part.window!r}"
-                if found is None
-                else f"its steady part of {part.duration:.3g} s"
-            )
-            words = (
-                f"holds {held} of the {SEGMENTS} Welch segments needed; give at least"
-                f" {SHORTEST:g} s"
-            )
-            raise ValueError(f"{self.name}: {what} {words}")
         return part._straight()
+
+    def _hold(self) -> "Recording":
+        """The recording with the plateau of its ramp-and-hold as window, see `steady`."""
+        even = self.resampled(RECORDED.rate)
+        everything = found = (0, even.whole.size)
+        if self.quantity not in FLOATING:
+            rest = find_rest(even.whole, even.rate)
+            level = rest.level if rest is not None and rest.quiet else 0.0
+            found = plateau(even.whole - level, even.rate)
+        if found is None:
+            resting = "".join(f". {said}" for said in self.notices if said.startswith(AT_REST))
+            raise ValueError(
+                f"{self.name}: no steady part was found: the signal must stay within 10 % of"
+                " one level for at least half of the time under load, and longer than 2 s. Is"
+                " it the right column? Then give the part yourself: --window a:b (in Python"
+                f" steady((a, b))), between {self.start:g} and {self.stop:g} s{resting}"
+            )
+        a, b = (min(self.start + edge / even.rate, self.stop) for edge in found)
+        said = UNRAMPED if found == everything else f"{FOUND}{a:.2f} s to {b:.2f} s"
+        return self._with(window=(a, b), notices=(*self.notices, said))
 
     def _straight(self) -> "Recording":
         """The recording without the straight line through its window, if it is to be so; with the
@@ -391,7 +316,7 @@ class Recording(Shown, eqx.Module):
             f"the straight line through {self.window_in_words} was subtracted and the mean kept:"
             f" {slope:.3g} {self.unit} in 1 s, {slope * self.duration:.3g} {self.unit} in all"
         )
-        return self._with(level, self.rate, self.window, (*self.notices, said), detrend=False)
+        return self._with(samples=level, notices=(*self.notices, said), detrend=False)
 
     def segments(self, settings: SpectrumSettings | str | None = None) -> int:
         """Number of whole Welch segments in the window."""
@@ -548,19 +473,14 @@ class Recording(Shown, eqx.Module):
 def recorded_settings(settings: SpectrumSettings | str | None) -> SpectrumSettings:
     """As given, or those of a name, by default the standard; named ones filter and sample as
     recordings are."""
-    given = isinstance(settings, SpectrumSettings)
-    return (
-        settings if given else SpectrumSettings.named(settings or "standard").replace(**AS_RECORDED)
-    )
+    if isinstance(settings, SpectrumSettings):
+        return settings
+    return SpectrumSettings.named(settings or "standard").replace(**AS_RECORDED)
 
 
 def _rate(rate: Any) -> float:
-    number = (
-        isinstance(rate, int | float | np.number)
-        and not isinstance(rate, bool)
-        and math.isfinite(rate)
-    )
-    require(number and rate > 0, "rate", rate, "give samples per second [Hz], above 0")
+    """The rate as a number. **Raises:** `ValueError` for one that is none, or too low."""
+    require(is_real(rate) and rate > 0, "rate", rate, "give samples per second [Hz], above 0")
     remedy = (
         f"too slow: half of it lies below what is to be seen of a force; record at {LOWEST_RATE:g}"
         " Hz or more"
@@ -595,43 +515,33 @@ def pooled_target(
     segments = [recording.segments(settings) for recording in recordings]
     signals = [recording.filtered(settings) for recording in recordings]
     held = signals if settings == RECORDED else [r.filtered(RECORDED) for r in recordings]
-    means = np.array([float(np.mean(x)) for x in signals])
-    variations = [
-        float(np.std(x)) / max(abs(m), 1e-300) for x, m in zip(signals, means, strict=True)
-    ]
-    mean = abs(float(np.mean(means)))
+    means = [abs(float(np.mean(x))) for x in signals]
+    # a mean of 0 has a variation beyond any bound, and no warning
+    variations = [float(np.std(x)) / max(m, 1e-300) for x, m in zip(signals, means, strict=True)]
+    mean = abs(float(np.mean([np.mean(x) for x in signals])))
     full = 100.0 if mvc is None and unit == "% MVC" else mvc
-    require(
-        full is None or 0 < mean <= full < math.inf,
-        "mvc",
-        mvc,
-        f"give a force above the mean, {mean:.4g}",
-    )
+    remedy = f"give a force above the mean, {mean:.4g}"
+    require(full is None or 0 < mean <= full < math.inf, "mvc", mvc, remedy)
     varying = quantity in ("force", "torque") and max(variations) <= 1
     power = np.average(rows, axis=0, weights=segments)
-    drifts = [_drift(x) if varying else () for x in signals]
-    each = list(
-        dict.fromkeys(
-            f"{recording.source}, {recording.window_in_words}" for recording in recordings
-        )
-    )
+    each = "; ".join(dict.fromkeys(f"{r.source}, {r.window_in_words}" for r in recordings))
     return Target(
         name,
         power / np.sum(power),
         quantity=str(quantity),
         provenance=provenance,
-        source="; ".join(each) if len(rows) == 1 else f"{len(rows)} trials: {'; '.join(each)}",
+        source=each if len(rows) == 1 else f"{len(rows)} trials: {each}",
         segments=segments,
         coefficient_of_variation=variations if varying else None,
         mvc_fraction=None if full is None else mean / full,
-        mean=np.abs(means).tolist() if varying else None,
+        mean=means if varying else None,
         unit=unit,
         recorded_at=_rate_of_all(recordings, segments),
         trial_power=rows if len(rows) > 1 else None,
         settings=settings,
         measured=measure_signals(held, unit, quantity)[1],
         signals=held,
-        notices=notices_of(recordings, signals, settings.rate, drifts, quantity),
+        notices=notices_of(recordings, signals, settings.rate, quantity, drift=varying),
     )
 
 
@@ -646,35 +556,33 @@ def notices_of(
     recordings: Sequence[Recording],
     signals: Sequence[np.ndarray],
     rate: float,
-    more: Sequence[tuple[str, ...]],
     quantity: str | None,
+    *,
+    drift: bool = False,
 ) -> tuple[str, ...]:
     """What to mind of recordings of one condition, whose windows hold these low-passed signals;
-    `more` of each of them."""
+    with `drift` also where most of one is a straight line."""
     unit, held = recordings[0].unit, quantity in ("force", "torque")
     bursts = find_bursts(signals, rate) if held else []
-    kept = [any(n.endswith(OUTLIERS["keep"]) for n in r.notices) for r in recordings]
-    bursts = [b for b in bursts if not kept[b.signal]]  # outliers make one, and are named already
-    seen = [_events(r, [b for b in bursts if b.signal == i]) for i, r in enumerate(recordings)]
-    # a slip of a second looks like another level
-    seen = [
-        own or (_ramped(x, rate, unit) if held else ())
-        for own, x in zip(seen, signals, strict=True)
-    ]
-    each = [(*event, *own) for event, own in zip(seen, more, strict=True)]
+    each = [list(recording.notices) for recording in recordings]
+    for i, (own, signal) in enumerate(zip(each, signals, strict=True)):
+        # outliers that are kept make a burst, and are named already
+        named = any(notice.endswith(OUTLIERS["keep"]) for notice in own)
+        mine = [burst for burst in bursts if burst.signal == i and not named]
+        events = _events(recordings[i], mine)
+        # a slip of a second looks like another level
+        own += events or (_ramped(signal, rate, unit) if held else ())
+        own += _drift(signal) if drift else ()
+    names = [recording.name for recording in recordings]
+    said = _with_names(each, names)
+    if held:
+        return (*said, *unlike(names, signals, unit))
     unclear = (
         f"the unit {unit} does not say what was measured: is it the right column? A coefficient of"
         " variation makes sense only of a signal that is zero without force, and in proportion"
         " to it"
     )
-    alike = (
-        unlike([r.name for r in recordings], signals, unit)
-        if held
-        else (unclear,)
-        if quantity is None
-        else ()
-    )
-    return (*_notices(recordings, each), *alike)
+    return (*said, unclear) if quantity is None else said
 
 
 def _events(recording: Recording, bursts: Sequence[Burst]) -> tuple[str, ...]:
@@ -701,14 +609,10 @@ def _ramped(x: Float[np.ndarray, " times"], rate: float, unit: str) -> tuple[str
     )
 
 
-def _notices(recordings: Sequence[Recording], more: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-    """Those of every trial, each once, with the names of the trials unless all say so; the steady
-    parts in one."""
-    said = [
-        (notice, r.name)
-        for r, own in zip(recordings, more, strict=True)
-        for notice in (*r.notices, *own)
-    ]
+def _with_names(each: Sequence[Sequence[str]], names: Sequence[str]) -> tuple[str, ...]:
+    """The notices of every trial, each once, with the names of the trials unless all say so; the
+    steady parts in one."""
+    said = [(notice, name) for own, name in zip(each, names, strict=True) for notice in own]
     windows = [
         f"{notice.removeprefix(FOUND)} in {name}"
         for notice, name in said
@@ -719,30 +623,28 @@ def _notices(recordings: Sequence[Recording], more: Sequence[tuple[str, ...]]) -
     for notice, name in said:
         joined = len(windows) > 1 and notice.startswith(FOUND)
         whose.setdefault(together if joined else notice, []).append(name)
-    alone = {together} | {
-        notice for notice, names in whose.items() if len(names) == len(recordings)
-    }
     return tuple(
-        notice if notice in alone else f"{', '.join(names)}: {notice}"
-        for notice, names in whose.items()
+        notice
+        if notice == together or len(trials) == len(names)
+        else f"{', '.join(trials)}: {notice}"
+        for notice, trials in whose.items()
     )
 
 
 def unlike(names: Sequence[str], signals: Sequence[np.ndarray], unit: str) -> tuple[str, ...]:
     """What to say of trials that are the same, or whose means differ by more than a tenth."""
     said = [
-        f"{names[i]} and {names[k]} hold the same numbers: give each trial once, or the errors come"
+        f"{one} and {other} hold the same numbers: give each trial once, or the errors come"
         " out too small"
-        for k in range(len(signals))
-        for i in range(k)
-        if np.array_equal(signals[i], signals[k])
+        for (one, x), (other, y) in itertools.combinations(zip(names, signals, strict=True), 2)
+        if np.array_equal(x, y)
     ]
-    means = [abs(float(np.mean(x))) for x in signals]
-    low, high = int(np.argmin(means)), int(np.argmax(means))
-    if means[high] > UNLIKE * means[low]:
+    means = {abs(float(np.mean(x))): name for x, name in zip(signals, names, strict=True)}
+    low, high = min(means), max(means)
+    if high > UNLIKE * low:
         said.append(
-            f"the means of the trials reach from {means[low]:.4g} {unit} ({names[low]}) to"
-            f" {means[high]:.4g} {unit} ({names[high]}): are they of one condition, and did the"
+            f"the means of the trials reach from {low:.4g} {unit} ({means[low]}) to"
+            f" {high:.4g} {unit} ({means[high]}): are they of one condition, and did the"
             " person tire?"
         )
     return tuple(said)

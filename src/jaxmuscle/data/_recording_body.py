@@ -4,6 +4,7 @@ import array
 import dataclasses
 import io
 import itertools
+import math
 import re
 from collections.abc import Iterator
 
@@ -20,7 +21,6 @@ _MOMENT = re.compile(
     r"(?:\d{4}-\d\d-\d\d[T ]|\d\d?[./]\d\d?[./]\d{4}"
     r" )?(\d\d?):(\d\d):(\d\d(?:[.,]\d+)?)(?:Z|[+-]\d\d:?\d\d)?"
 )
-_PIECE = 1 << 22  # bytes that are looked at together
 _ROWS = 1 << 16
 
 
@@ -72,46 +72,28 @@ class Body:
 
     def check(self) -> None:
         """**Raises:** `ValueError` for a line with another number of columns."""
-        if self._even():
+        if not self._uneven_line().search(self.data, self.start):
             return
+        # such a line, or one with a delimiter in quotes
         for number, cells in self.rows():
             found = len(cells) - (len(cells) == self.width + 1 and not cells[-1])
             if found != self.width:
-                begun = re.match(rb"(Interval=)", self.data[:100]) and cells[0].startswith(
-                    "Interval="
-                )
-                remedy = (
-                    "a second block begins there; save each block on its own"
-                    if begun
-                    else width_remedy(self.delimiter)
-                )
+                begun = self.data.startswith(b"Interval=") and cells[0].startswith("Interval=")
+                remedy = "a second block begins there; save each block on its own"
+                remedy = remedy if begun else width_remedy(self.delimiter)
                 raise ValueError(
                     f"{self.file}, line {number}: {found} of {self.width} columns found; {remedy}"
                 )
 
-    def _even(self) -> bool:
-        """Whether every line has as many delimiters as it should, counted in pieces of the
-        bytes."""
-        position, expected = self.start, self.width - 1 + self.trailing
-        while position < len(self.data):
-            end = self.data.find(b"\n", min(position + _PIECE, len(self.data)))
-            end = len(self.data) if end < 0 else end + 1
-            letters = np.frombuffer(self.data, np.uint8, end - position, position)
-            if self.delimiter is None:
-                blank = (letters == 32) | ((letters >= 9) & (letters <= 13))
-                marks = np.flatnonzero(~blank & np.concatenate(([True], blank[:-1])))
-                wanted = self.width
-            else:
-                marks, wanted = np.flatnonzero(letters == ord(self.delimiter)), expected
-            ends = np.flatnonzero(letters == 10)
-            ends = ends if self.data[end - 1 : end] == b"\n" else np.append(ends, letters.size)
-            counts = np.diff(np.searchsorted(marks, ends), prepend=0)
-            begins = np.concatenate(([0], ends[:-1] + 1))
-            wrong = (counts != wanted) & (ends > begins)
-            if np.any(wrong):
-                return False
-            position = end
-        return True
+    def _uneven_line(self) -> re.Pattern[bytes]:
+        """A line that is not empty and has more or fewer delimiters than the others."""
+        if self.delimiter is None:
+            even = rb"[^\S\n]*+(?:\S++[^\S\n]++){%d}\S++[^\S\n]*+" % (self.width - 1)
+        else:
+            sign = self.delimiter.encode()
+            count = self.width - 1 + self.trailing
+            even = b"[^%b\n]*+(?:%b[^%b\n]*+){%d}" % (sign, sign, sign, count)
+        return re.compile(b"(?m)^(?!%b$).+" % even)
 
     def column(self, index: int, name: str) -> Float[np.ndarray, " rows"]:
         """One column as numbers, NaN where it has none.
@@ -157,21 +139,19 @@ class Body:
         return np.concatenate([part[index].to_numpy() for part in parts])
 
     def _slowly(self, index: int, name: str) -> Float[np.ndarray, " rows"]:
-        values, value = array.array("d"), _moment if index in self.moments else number_in
+        values, number_of = array.array("d"), _moment if index in self.moments else number_in
         for number, cells in self.rows():
+            place = f"{self.file}, line {number}: "
             # a quotation mark that is not closed hides the delimiters behind it
             if len(cells) <= index:
                 found = f"{len(cells)} of {self.width} columns found"
-                raise ValueError(
-                    f'{self.file}, line {number}: {found}; a quotation mark (") may be open'
-                )
+                raise ValueError(f'{place}{found}; a quotation mark (") may be open')
             cell = cells[index]
             try:
-                values.append(
-                    float("nan") if cell.casefold() in MISSING else value(cell, self.delimiter)
-                )
+                missing = cell.casefold() in MISSING
+                values.append(math.nan if missing else number_of(cell, self.delimiter))
             except ValueError:
-                problem = f"{self.file}, line {number}: {name} {cell!r} is not a number"
+                problem = f"{place}{name} {cell!r} is not a number"
                 raise ValueError(f"{problem}; leave it empty if it is not known") from None
         return np.frombuffer(values).copy()
 

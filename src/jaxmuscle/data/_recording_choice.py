@@ -5,12 +5,12 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle._common.arguments import require
+from jaxmuscle._common.arguments import is_real, require
 from jaxmuscle._common.text import choices, printable
 
 from ._recording_outliers import OUTLIERS, find_outliers
@@ -54,9 +54,29 @@ class Movement(NamedTuple):
 
 
 class _Choice(NamedTuple):
+    """The columns that are read, what they are called together, and what to say where they were
+    chosen among several."""
+
     name: str
     columns: list[str]
-    told: str = ""  # what to say of it, where it was chosen among several
+    notice: str = ""
+
+
+class ReadingOptions(TypedDict, total=False):
+    """The arguments of `load_recording` by which a recording is found in a table."""
+
+    column: str | int | None
+    rate: float | int | None
+    units: str | None
+    axis: str | None
+    reference: str | int | None
+    time: str | int | None
+    max_gap: float | int
+    lever_arm: float | int | None
+    outliers: str
+    quantity: str | None
+    baseline: Baseline
+    detrend: bool
 
 
 class Reading(NamedTuple):
@@ -81,85 +101,77 @@ def _sampled(
 ) -> tuple[Sampling, np.ndarray]:
     """How columns are sampled, and what to say of it; the columns, without outliers if that is
     asked for."""
-    longest = reading.max_gap
-    require(
-        isinstance(longest, int | float) and 0 <= longest < math.inf,
-        "max_gap",
-        longest,
-        "give a time in s",
-    )
-    require(reading.outliers in OUTLIERS, "outliers", reading.outliers, "choose keep or mask")
-    found = sampling(table, name, times, signal.shape[0], reading.rate, float(longest))
+    longest, choice = reading.max_gap, reading.outliers
+    require(is_real(longest) and longest >= 0, "max_gap", longest, "give a time in s")
+    require(choice in OUTLIERS, "outliers", choice, "choose keep or mask")
+    found = sampling(table, name, times, len(signal), reading.rate, float(longest))
     seconds = np.arange(len(signal)) / found.rate if found.time is None else found.time
     odd, words = find_outliers(signal, seconds)
-    if reading.outliers == "mask":
+    if choice == "mask":
         signal = np.where(odd[:, None], np.nan, signal)
-    told = [each + OUTLIERS[reading.outliers] for each in words]
-    return found._replace(notices=[*found.notices, *told]), signal
+    said = [each + OUTLIERS[choice] for each in words]
+    return found._replace(notices=[*found.notices, *said]), signal
 
 
-def _of_parts(
-    make: Callable[..., Any],
-    found: Sampling,
-    signal: np.ndarray,
-    longest: float,
-    notices: list[str],
+def _make_parts(
+    make: Callable[..., Any], found: Sampling, signal: np.ndarray, reading: Reading, place: str
 ) -> Any:
     """What `make` makes of the longest part, gaps closed; the others beside it, those that can be
-    read."""
+    read. An error begins with the `place`."""
 
-    def made(part: Part, **more: Any) -> Any:
-        whole, begin, closed = filled(part.on_grid(signal), found.rate, longest)
-        return make(whole, start=part.start + begin, notices=(*notices, *closed), **more)
+    def make_part(part: Part, **more: Any) -> Any:
+        even = part.on_grid(signal)
+        whole, begin, closed = filled(even, found.rate, float(reading.max_gap))
+        return make(
+            whole,
+            found.rate,
+            start=part.start + begin,
+            notices=(*found.notices, *closed),
+            baseline=reading.baseline,
+            detrend=reading.detrend,
+            **more,
+        )
 
+    longest, *pauses = found.parts
     others = []
-    for part in found.parts[1:]:
+    for part in pauses:
         with contextlib.suppress(ValueError):
-            others.append(made(part))
-    return made(found.parts[0], others=others)
+            others.append(make_part(part))
+    try:
+        return make_part(longest, others=others)
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from None
 
 
 def recording_of(
     make: Callable[..., Any], table: Table, reading: Reading, name: str | None = None
 ) -> Any:
     """What `make`, the class of a recording, makes of a column, called `name` or as its file."""
-    column, axis, reference = reading.column, reading.axis, reading.reference
+    axis, reference = reading.axis, reading.reference
     require(axis in (None, *AXES, "principal"), "axis", axis, "choose one of x, y, z, principal")
     times = clock(table, reading.time)
-    chosen = _chosen(table, column, axis, reference, None if times is None else times.name)
+    chosen = _chosen(table, reading, None if times is None else times.name)
     times = clock(table, reading.time, chosen.columns[0]) if table.clocks else times
     signal = values(table, chosen.columns)
     if reference is not None:
-        signal = signal - values(table, _reference(table, reference, axis, signal.shape))
+        signal = signal - values(table, _reference(table, reference, axis, len(signal)))
     found, signal = _sampled(table, signal, chosen.columns[0], times, reading)
-    notices = [*table.notices, *([chosen.told] if chosen.told else []), *found.notices]
+    notices = [*table.notices, *filter(None, [chosen.notice]), *found.notices]
     unit, quantity = _unit(table, chosen, reading, notices)
     if reading.lever_arm is not None:
         signal, unit = _as_force(table, chosen.name, signal, unit, reading.lever_arm, notices)
         quantity = None
-    words = [
-        Path(table.file).name,
-        f"column {chosen.name}" if axis is None else f"point {chosen.name}, axis {axis}",
-    ]
-    words += [f"minus {reference}"] * (reference is not None) + [f"{found.rate:.6g} Hz"]
+    what = f"column {chosen.name}" if axis is None else f"point {chosen.name}, axis {axis}"
+    minus = "" if reference is None else f", minus {reference}"
+    source = printable(f"{Path(table.file).name}, {what}{minus}, {found.rate:.6g} Hz")
 
-    def made(whole: np.ndarray, **more: Any) -> Any:
-        return make(
-            whole[:, 0] if whole.shape[1] == 1 else _principal(whole),
-            found.rate,
-            unit=unit,
-            quantity=quantity,
-            baseline=reading.baseline,
-            detrend=reading.detrend,
-            name=name or table.name,
-            source=printable(", ".join(words)),
-            **more,
-        )
+    def make_one(whole: np.ndarray, rate: float, **more: Any) -> Any:
+        one = whole[:, 0] if whole.shape[1] == 1 else _principal(whole)
+        called = name or table.name
+        return make(one, rate, unit=unit, quantity=quantity, name=called, source=source, **more)
 
-    try:
-        return _of_parts(made, found, signal, float(reading.max_gap), notices)
-    except ValueError as error:
-        raise ValueError(f"{table.file}: column {chosen.name}: {error}") from None
+    found = found._replace(notices=notices)
+    return _make_parts(make_one, found, signal, reading, f"{table.file}: column {chosen.name}")
 
 
 def perturbed_of(
@@ -187,8 +199,7 @@ def perturbed_of(
             f"{table.file}: force={columns['force']!r} and displacement={columns['displacement']!r}"
             f" {fault}"
         )
-    signal = values(table, names.values())
-    found, signal = _sampled(table, signal, force, times, reading)
+    found, signal = _sampled(table, values(table, names.values()), force, times, reading)
     notices = [*table.notices, *found.notices]
     units, _ = _unit(table, _Choice(force, [force]), reading, notices)
     if units in SCALELESS:
@@ -203,25 +214,12 @@ def perturbed_of(
             " insertion, the force alone, as `column`"
         )
     source = f"{Path(table.file).name}, columns {force} and {displacement}, {found.rate:.6g} Hz"
+    known = {"units": units, "displacement_units": moved, "name": table.name, **options}
 
-    def made(whole: np.ndarray, **more: Any) -> Any:
-        return make(
-            *whole.T,
-            found.rate,
-            units=units,
-            displacement_units=moved,
-            baseline=reading.baseline,
-            detrend=reading.detrend,
-            name=table.name,
-            source=printable(source),
-            **options,
-            **more,
-        )
+    def make_one(whole: np.ndarray, rate: float, **more: Any) -> Any:
+        return make(*whole.T, rate, source=printable(source), **known, **more)
 
-    try:
-        return _of_parts(made, found, signal, float(reading.max_gap), notices)
-    except ValueError as error:
-        raise ValueError(f"{table.file}: {error}") from None
+    return _make_parts(make_one, found._replace(notices=notices), signal, reading, table.file)
 
 
 def _as_force(
@@ -246,47 +244,36 @@ def signals(table: Table, time: str | int | None) -> list[str]:
     return _others(table, None if times is None else times.name)
 
 
-def _chosen(
-    table: Table,
-    column: str | int | None,
-    axis: str | None,
-    reference: str | int | None,
-    time: str | None,
-) -> _Choice:
+def _chosen(table: Table, reading: Reading, time: str | None) -> _Choice:
     """The column, or the columns of the point of which an axis is asked."""
-    if axis is not None:
-        return _point(table, column, axis, reference, time)
-    if column is not None:
-        name = find(table, column)
+    others = _others(table, time)
+    if reading.axis is not None:
+        return _point(table, reading, others)
+    if reading.column is not None:
+        name = find(table, reading.column)
         if name == time and len(table.columns) > 1:
             raise ValueError(
-                f"{table.file}: column {column!r} is the time; choose one of"
-                f" {listed(_others(table, time))}"
+                f"{table.file}: column {reading.column!r} is the time; choose one of"
+                f" {listed(others)}"
             )
         return _Choice(name, [name])
-    others = _others(table, time)
-    if reference is not None:
-        others = [name for name in others if name != find(table, reference, "reference")]
-    if len(others) > 1:
-        forces = [name for name in others if measured_in(table, name) in ("force", "torque")]
-        forces = (
-            forces
-            if len(forces) == 1
-            else [name for name in forces or others if FORCE.fullmatch(_NUMBER.sub("", bare(name)))]
-        )
-        if len(forces) == 1:
-            return _Choice(
-                forces[0],
-                forces,
-                f"column {forces[0]} taken, of {listed(others)}" + _moved(table, others, forces[0]),
-            )
-    if len(others) != 1:
-        which = listed(others) or "none"
+    if reading.reference is not None:
+        beside = find(table, reading.reference, "reference")
+        others = [name for name in others if name != beside]
+    if len(others) == 1:
+        return _Choice(others[0], others)
+    forces = [name for name in others if measured_in(table, name) in MEASURED["force"]]
+    if len(forces) != 1:
+        called = forces or others
+        forces = [name for name in called if FORCE.fullmatch(_NUMBER.sub("", bare(name)))]
+    if len(forces) != 1:
         raise ValueError(
             f"{table.file}: holds {len(others)} columns besides the time; choose one with `column`:"
-            f" {which}"
+            f" {listed(others) or 'none'}"
         )
-    return _Choice(others[0], others)
+    (force,) = forces
+    taken = f"column {force} taken, of {listed(others)}{_moved(table, others, force)}"
+    return _Choice(force, forces, taken)
 
 
 def _others(table: Table, time: str | None) -> list[str]:
@@ -298,29 +285,28 @@ def movement_of(table: Table, name: str) -> Movement:
     """How much a column moves in the middle half of a recording, see `movement`."""
     samples = values(table, [name])[:, 0]
     middle = samples[samples.size // 4 : samples.size - samples.size // 4]
-    size = float(np.std(middle[np.isfinite(middle)])) if np.isfinite(middle).any() else math.nan
+    middle = middle[np.isfinite(middle)]
+    size = float(np.std(middle)) if middle.size else math.nan
     unit, measured = table.units.get(name, ""), measured_in(table, name)
     if measured not in MEASURED["displacement"]:
         return Movement(size, unit, size == 0)
-    turned = measured == "angle"
     scale, _ = scale_to_si(unit, "displacement_units", "displacement", 1.0)
-    size *= scale * (180 / math.pi if turned else 1e3)
-    shown = "deg" if turned else "mm"
+    shown, many = ("deg", 180 / math.pi) if measured == "angle" else ("mm", 1e3)
+    size *= scale * many
     return Movement(size, shown, size < STILL[shown])
 
 
 def _moved(table: Table, others: list[str], force: str) -> str:
     """What to say where a column is a displacement: the answer to a motor is no fluctuation of a
     hold."""
-    moving = next(
-        (name for name in others if measured_in(table, name) in MEASURED["displacement"]), None
-    )
+    kinds = {name: measured_in(table, name) for name in others}
+    moving = next((name for name in others if kinds[name] in MEASURED["displacement"]), None)
     if moving is None:
         return ""
     moves = movement_of(table, moving)
     if moves.rests:
         return f". {moving} rests: it moves by {moves}"
-    turned = {measured_in(table, name) for name in (force, moving)} & {"torque", "angle"}
+    turned = {kinds[force], kinds[moving]} & {"torque", "angle"}
     arm = " --lever-arm METRES" if turned else ""
     return (
         f". {moving} moves by {moves}, so `jaxmuscle fit` takes it for a record of a moved"
@@ -330,12 +316,12 @@ def _moved(table: Table, others: list[str], force: str) -> str:
     )
 
 
-def _point(
-    table: Table, column: str | int | None, axis: str, reference: str | int | None, time: str | None
-) -> _Choice:
-    known, others = points(table), _others(table, time)
+def _point(table: Table, reading: Reading, others: list[str]) -> _Choice:
+    """The columns of the point that is asked for, or of the only one."""
+    known, axis, column = points(table), str(reading.axis), reading.column
     if column is None:
-        stems = [stem for stem in known if reference is None or stem != str(reference).casefold()]
+        beside = str(reading.reference).casefold()
+        stems = [stem for stem in known if reading.reference is None or stem != beside]
         if not known and len(others) == 3:
             return _Choice("the three columns", _axis(others, axis))
         if len(stems) != 1:
@@ -358,21 +344,19 @@ def _axis(columns: list[str], axis: str) -> list[str]:
     return columns if axis == "principal" else [columns[AXES.index(axis)]]
 
 
-def _reference(
-    table: Table, reference: str | int, axis: str | None, shape: tuple[int, ...]
-) -> list[str]:
-    columns = None if axis is None else triple(table, str(reference))
-    if columns is not None and axis is not None:
-        names = _axis(columns, axis)
-    elif axis is None:
+def _reference(table: Table, reference: str | int, axis: str | None, rows: int) -> list[str]:
+    """The columns that are subtracted."""
+    if axis is None:
         names = [find(table, reference, "reference")]
+    elif (columns := triple(table, str(reference))) is not None:
+        names = _axis(columns, axis)
     else:
         have = listed(points(table)) or "none"
         raise ValueError(f"{table.file}: no point {reference!r} as reference; known points: {have}")
-    rows = values(table, names).shape[0]
-    if rows != shape[0]:
+    own = len(values(table, names))
+    if own != rows:
         raise ValueError(
-            f"{table.file}: reference={reference!r} has {rows} samples, the column {shape[0]}"
+            f"{table.file}: reference={reference!r} has {own} samples, the column {rows}"
         )
     return names
 

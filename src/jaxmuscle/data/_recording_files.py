@@ -6,16 +6,17 @@ import os
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Unpack, overload
 
 from jaxmuscle._common.arguments import require
+from jaxmuscle._common.files import expanded
 from jaxmuscle._common.inputs import BEYOND, looked_at, most, read_bytes
 from jaxmuscle._common.text import choices
 
 from ._apart import read_apart
 from ._perturbed import PerturbedRecording
 from ._recording import Recording
-from ._recording_choice import Reading, perturbed_of, recording_of, signals
+from ._recording_choice import Reading, ReadingOptions, perturbed_of, recording_of, signals
 from ._recording_csv import read_csv
 from ._recording_quality import Baseline
 from ._recording_table import Table, channels_table, find
@@ -26,7 +27,7 @@ from .dialects._dialects import EXPORTS
 BOOKS = (".xlsx", ".xlsm")
 BINARY = (".mat", ".npy", ".npz", ".c3d", ".edf", ".bdf", ".tdms", ".acq", ".smr")
 KINDS = (*TEXT, ".xlsx", *BINARY, ".xlsm", ".gz")
-TARGETS = (".toml", ".json", ".tar")
+TARGETS = (".toml", ".json")
 ROWS = 90  # that the shortest recording has
 
 
@@ -130,22 +131,17 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
     )
     options = {"displacement_units": displacement_units, "positive": positive, "delay": delay}
     if force is None or displacement is None:
-        given = {"force": force, "displacement": displacement, **options, "delay": delay or None}
-        for name, value in given.items():
-            require(
-                value is None,
-                name,
-                value,
-                "belongs to recordings of two channels; give `force` and `displacement`",
-            )
-        return recording_of(Recording, read_table(path, skip_rows, sheet), reading)
-    for name in ("column", "axis", "reference", "quantity"):
-        value = getattr(reading, name)
-        require(
-            value is None, name, value, "leave it out: `force` and `displacement` name the columns"
-        )
-    columns = {"force": force, "displacement": displacement}
+        remedy = "belongs to recordings of two channels; give `force` and `displacement`"
+        strange = {"force": force, "displacement": displacement, **options, "delay": delay or None}
+    else:
+        remedy = "leave it out: `force` and `displacement` name the columns"
+        strange = {"column": column, "axis": axis, "reference": reference, "quantity": quantity}
+    for name, value in strange.items():
+        require(value is None, name, value, remedy)
     table = read_table(path, skip_rows, sheet)
+    if force is None or displacement is None:
+        return recording_of(Recording, table, reading)
+    columns = {"force": force, "displacement": displacement}
     return perturbed_of(
         PerturbedRecording.from_array, table, reading, columns, lever_arm=lever_arm, **options
     )
@@ -155,33 +151,28 @@ def load_columns(
     path: str | os.PathLike[str] | Table,
     columns: Iterable[str | int] | None = None,
     *,
-    time: str | int | None = None,
     skip_rows: int = 0,
     sheet: str | int | None = None,
-    **options: Any,
+    **options: Unpack[ReadingOptions],
 ) -> list[Recording]:
     """A recording `FILE COLUMN` of each of the columns, by default of all with numbers but the
     time; of several sheets of a workbook one `FILE SHEET` each, if no columns are named.
 
-    `time`, `skip_rows`, `sheet` and the other options are those of `load_recording`.
+    `skip_rows`, `sheet` and the other options are those of `load_recording`.
     """
-    tables = read_tables(path, skip_rows, sheet)
+    tables, reading = read_tables(path, skip_rows, sheet), Reading(**options)
     if columns is None and len(tables) > 1:
-        return [recording_of(Recording, t, Reading(time=time, **options)) for t in tables]
-    require(
-        columns is None or len(columns := list(columns)) > 0,
-        "columns",
-        columns,
-        "give the names of the columns that are recordings",
-    )
+        return [recording_of(Recording, table, reading) for table in tables]
+    asked = None if columns is None else list(columns)
+    require(asked != [], "columns", asked, "give the names of the columns that are recordings")
     found: list[Recording] = []
     for table in tables:
-        names = signals(table, time) if columns is None else columns
+        names = asked or signals(table, reading.time)
         if not names:
             raise ValueError(f"{table.file}: holds no column with numbers besides the time")
         for name in (find(table, each, "columns") for each in names):
-            reading = Reading(name, time=time, **options)
-            found.append(recording_of(Recording, table, reading, f"{table.name} {name}"))
+            own = reading._replace(column=name)
+            found.append(recording_of(Recording, table, own, f"{table.name} {name}"))
     return found
 
 
@@ -227,16 +218,10 @@ def read_tables(
     if isinstance(path, Table):
         return [path]
     require(isinstance(path, str | os.PathLike), "path", path, "give the path of a recording")
-    file = Path(path)
-    with contextlib.suppress(RuntimeError):
-        file = file.expanduser()
+    file = expanded(path)
     kind = file.suffix.lower()
-    require(
-        isinstance(skip_rows, int) and skip_rows >= 0,
-        "skip_rows",
-        skip_rows,
-        "give a number of lines",
-    )
+    whole = isinstance(skip_rows, int) and skip_rows >= 0
+    require(whole, "skip_rows", skip_rows, "give a number of lines")
     instead = f"a recording ({', '.join(KINDS)})"
     text = kind in TEXT or is_text(file)
     book = kind in BOOKS and not text
@@ -301,29 +286,27 @@ def _sheets(
 
     if asked is not None:
         return [read(_asked(file, names, asked))]
-    found: dict[str, Table] = {}
+    found: list[Table] = []
     for name, text in sheets.items():
         with contextlib.suppress(ValueError):  # what is no table of numbers holds no signal
             if text.count(b"\n") >= ROWS and signals(table := read(name), None):
-                found[name] = table
-    if len(_layouts(found)) > 1:  # a table of results has no times
-        timed = {name: t for name, t in found.items() if t.rates or clock(t) is not None}
-        found = timed or found
-    layouts = _layouts(found)
-    if len(layouts) != 1:
-        which = ", ".join(found) or "none"
+                found.append(table)
+    if not _are_alike(found):  # a table of results has no times
+        found = [each for each in found if each.rates or clock(each) is not None] or found
+    which = ", ".join(table.sheet for table in found) or "none"
+    if not found or not _are_alike(found):
+        first = found[0].sheet if found else names[0]
         raise ValueError(
             f"{file}: holds the sheets {', '.join(names)}; with {ROWS} rows of numbers or more:"
-            f" {which}. Choose one with `sheet`, as sheet={next(iter(found), names[0])!r}"
+            f" {which}. Choose one with `sheet`, as sheet={first!r}"
         )
-    others = ", ".join(name for name in names if name not in found)
-    what = f"sheet {next(iter(found))} taken" if len(found) == 1 else "the sheets are trials"
-    more = f", of {', '.join(names)}" if others else f": {', '.join(names)}"
-    return [table._replace(notices=(f"{what}{more}", *table.notices)) for table in found.values()]
+    what = f"sheet {which} taken" if len(found) == 1 else "the sheets are trials"
+    notice = f"{what}{':' if len(found) == len(names) else ', of'} {', '.join(names)}"
+    return [table._replace(notices=(notice, *table.notices)) for table in found]
 
 
-def _layouts(tables: dict[str, Table]) -> set[tuple[str, ...]]:
-    return {tuple(table.columns) for table in tables.values()}
+def _are_alike(tables: list[Table]) -> bool:
+    return len({tuple(table.columns) for table in tables}) <= 1
 
 
 def _asked(file: Path, names: list[str], sheet: str | int) -> str:

@@ -1,13 +1,14 @@
-"""Recordings in binary files: MATLAB (.mat, also v7.3), NumPy (.npy, .npz) and C3D. Run by
-`_apart_child` alone."""
+"""Recordings in files that are not text: MATLAB (.mat, also v7.3), NumPy (.npy, .npz), C3D, and by
+the libraries for them Excel, EDF, TDMS, AcqKnowledge and Spike2. Run by `_apart_child` alone."""
 
+import importlib
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ._recording_channels import Channel, TooLarge
+from ._recording_channels import Channel, TooLarge, numbers
 from .dialects._dialects import DIALECTS
 from .dialects._variables import stated
 
@@ -142,68 +143,123 @@ def _channels(content: Mapping[str, Any], beside: Sequence[Channel] = ()) -> lis
     """
     variables = dict(_flat(content))
     found: dict[str, list[Channel]] = {}
-    for name, value in variables.items():
-        if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf":
+    for name, array in variables.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf" or array.ndim > 2:
             continue
-        array = value
-        array = (
-            array.reshape(-1, 1)
-            if array.ndim < 2 or array.shape in ((1, array.size), (array.size, 1))
-            else array
-        )
-        if array.ndim == 2 and array.shape[0] >= 2 and array.shape[1]:
-            upright = array.T if array.shape[0] < array.shape[1] else array
-            found[name] = list(_columns(name, upright))
+        upright = array.reshape(-1, 1) if array.ndim < 2 else array
+        upright = upright.T if upright.shape[0] < upright.shape[1] else upright
+        if upright.shape[0] >= 2 and upright.shape[1]:
+            labels = [str(i) if not name else f"{name}:{i}" for i in range(upright.shape[1])]
+            labels = [name] if len(labels) == 1 and name else labels
+            found[name] = [Channel(*each) for each in zip(labels, upright.T, strict=True)]
     if not found and not beside:
         raise ValueError("holds no numbers in one or two dimensions")
     return stated(variables, found)
 
 
-def _columns(name: str, array: np.ndarray) -> Iterator[Channel]:
-    for index, column in enumerate(array.T):
-        label = name if array.shape[1] == 1 and name else f"{name}:{index}" if name else str(index)
-        yield Channel(label, column)
-
-
 def read_c3d(path: str, most: int) -> list[Channel]:
     """Points as `NAME_x`, `NAME_y`, `NAME_z` and analog channels by name; a negative residual is a
-    gap.
-
-    **Raises:** `ImportError` that says what to install.
-    """
-    try:
-        import ezc3d  # pyright: ignore
-    except ImportError:
-        raise ImportError("reading C3D needs ezc3d: pip install ezc3d") from None
-    content: Any = ezc3d.c3d(path)
-    found: list[Channel] = []
+    gap."""
+    content = _library("ezc3d", "reading C3D").c3d(path)
     point, analog = content["parameters"]["POINT"], content["parameters"]["ANALOG"]
     xyz = np.array(content["data"]["points"][:3], dtype=float)
     lost = np.asarray(content["data"]["meta_points"]["residuals"])[0] < 0
     xyz[:, lost] = np.nan
-    unit = _first(point, "UNITS", 0)
-    for i, label in enumerate(_labels(point, xyz.shape[1])):
-        found += [
-            Channel(f"{label}_{axis}", values, _rate(point), unit)
-            for axis, values in zip("xyz", xyz[:, i], strict=True)
-        ]
-    channels = np.asarray(content["data"]["analogs"])[0]
-    for i, label in enumerate(_labels(analog, len(channels))):
-        found.append(Channel(label, channels[i], _rate(analog), _first(analog, "UNITS", i)))
+    analogs = np.asarray(content["data"]["analogs"])[0]
+    rate, unit = float(point["RATE"]["value"][0]), _entry(point, "UNITS", 0)
+    found = [
+        Channel(f"{_entry(point, 'LABELS', i) or f'channel {i}'}_{axis}", values, rate, unit)
+        for i in range(xyz.shape[1])
+        for axis, values in zip("xyz", xyz[:, i], strict=True)
+    ]
+    for i, values in enumerate(analogs):
+        name, rate = _entry(analog, "LABELS", i), float(analog["RATE"]["value"][0])
+        found.append(Channel(name or f"channel {i}", values, rate, _entry(analog, "UNITS", i)))
     if not found:
         raise ValueError("holds neither points nor analog channels")
     return found
 
 
-def _rate(group: Mapping[str, Any]) -> float:
-    return float(group["RATE"]["value"][0])
-
-
-def _labels(group: Mapping[str, Any], count: int) -> list[str]:
-    given = [str(label).strip() for label in group.get("LABELS", {"value": []})["value"]]
-    return [given[i] if i < len(given) and given[i] else f"channel {i}" for i in range(count)]
-
-
-def _first(group: Mapping[str, Any], key: str, index: int) -> str:
+def _entry(group: Mapping[str, Any], key: str, index: int) -> str:
     entries = group.get(key, {"value": []})["value"]
     return str(entries[index]).strip() if index < len(entries) else ""
+
+
+def _library(name: str, what: str = "reading this file") -> Any:
+    """The library for a format. **Raises:** `ImportError` that says what to install."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        package = name.partition(".")[0]
+        raise ImportError(f"{what} needs {package}: pip install {package}") from None
+
+
+def read_xlsx(path: str, most: int) -> dict[str, bytes]:
+    """The sheets of a workbook as texts with tabs, in which rows keep their numbers."""
+    _library("openpyxl")
+    import pandas
+
+    unpacked(path, most)
+    with pandas.ExcelFile(path, engine="openpyxl") as book:
+        names = [sheet.title for sheet in book.book.worksheets]  # there are sheets of charts, too
+        sheets: dict[str, Any] = {name: book.parse(name, header=None) for name in names}
+    if all(sheet.empty for sheet in sheets.values()):
+        raise ValueError("it holds no sheet that is not empty")
+    return {
+        name: sheet.replace(r"\s+", " ", regex=True)
+        .to_csv(sep="\t", header=False, index=False)
+        .encode()
+        for name, sheet in sheets.items()
+    }
+
+
+def read_edf(path: str, most: int) -> list[Channel]:
+    """EDF and BDF: signals by their labels, with rates and units."""
+    library = _library("edfio")
+    with open(path, "rb") as file:
+        read = library.read_bdf if file.read(1) == b"\xff" else library.read_edf
+    signals = read(path, header_encoding="latin-1").signals  # though the format allows ASCII alone
+    return [
+        Channel(each.label, each.data, each.sampling_frequency, each.physical_dimension)
+        for each in signals
+    ]
+
+
+def read_tdms(path: str, most: int) -> list[Channel]:
+    """TDMS: channels by name, as `GROUP/NAME` where several groups have it; the rate is that of the
+    waveform."""
+    groups = _library("nptdms").TdmsFile.read(path).groups()
+    found = [(group.name, channel) for group in groups for channel in group.channels()]
+    names = [channel.name for _, channel in found]
+
+    def read(group: str, channel: Any) -> Channel:
+        name, step = channel.name, channel.properties.get("wf_increment")
+        name = name if names.count(name) == 1 else f"{group}/{name}"
+        unit = "s" if channel.dtype.kind == "M" else str(channel.properties.get("unit_string", ""))
+        return Channel(name, numbers(channel[:]), 1 / step if step else None, unit)
+
+    return [read(group, channel) for group, channel in found if channel.dtype.kind in "iufM"]
+
+
+def read_acq(path: str, most: int) -> list[Channel]:
+    """AcqKnowledge: channels by name, with rates and units."""
+    file = _library("bioread").read_file(path)
+    return [Channel(c.name, numbers(c.data), c.samples_per_second, c.units) for c in file.channels]
+
+
+def read_smr(path: str, most: int) -> list[Channel]:
+    """Spike2: waveform channels by name, with rates and units."""
+    blocks = _library("neo.io").Spike2IO(filename=path).read_block(lazy=False).segments
+    if len(blocks) != 1:
+        raise ValueError(f"holds {len(blocks)} stretches with gaps between; save each on its own")
+    channels: list[Channel] = []
+    for group in blocks[0].analogsignals:
+        names = group.array_annotations.get("channel_names", [group.name])
+        rate, unit = (
+            float(group.sampling_rate.rescale("Hz").magnitude),
+            str(group.units.dimensionality),
+        )
+        channels += [
+            Channel(str(name), group.magnitude[:, i], rate, unit) for i, name in enumerate(names)
+        ]
+    return channels

@@ -72,48 +72,40 @@ def find_outliers(
             )
         there = there[~odd[there]]
         found = there[_spikes(x[there])]
+        odd[found] = True
         if len(found):
-            odd[found] = True
-            one = len(found) == 1
-            words.append(
-                f"{len(found)} sample{'' if one else 's'} {'lies' if one else 'lie'} {OUTSIDE}"
-                f" what {'its' if one else 'their'} neighbours allow (spikes), {_at(found, time)}"
+            what = (
+                f"sample lies {OUTSIDE} what its"
+                if len(found) == 1
+                else (f"samples lie {OUTSIDE} what their")
             )
+            words.append(f"{len(found)} {what} neighbours allow (spikes), {_at(found, time)}")
     return odd, words
 
 
 def _at(rows: Int[np.ndarray, " found"], time: Float[np.ndarray, " rows"]) -> str:
     """When: the first times, those of neighbours as one."""
-    first = np.flatnonzero(np.diff(rows, prepend=-2) > 1)
-    last = np.append(first[1:], len(rows)) - 1
-    spans = [
-        f"{time[rows[a]]:.3f}" + f" to {time[rows[b]]:.3f}" * bool(b > a)
-        for a, b in zip(first[:NAMED], last[:NAMED], strict=True)
-    ]
-    more = f" and {len(first) - NAMED} more times" if len(first) > NAMED else ""
-    return f"at {', '.join(spans)} s{more}"
+    groups = np.split(time[rows], np.flatnonzero(np.diff(rows) > 1) + 1)
+    spans = [" to ".join(f"{edge:.3f}" for edge in dict.fromkeys((g[0], g[-1]))) for g in groups]
+    more = f" and {len(spans) - NAMED} more times" if len(spans) > NAMED else ""
+    return f"at {', '.join(spans[:NAMED])} s{more}"
 
 
 def _marks(x: Float[np.ndarray, " there"]) -> list[float]:
     """Values that stand for something else than a measurement."""
-    found: list[float] = []
-    while x.size:
-        ends = float(np.min(x)), float(np.max(x))
-        rest = x[(x != ends[0]) & (x != ends[1])]
-        if rest.size < max(x.size / 2, 8) or np.ptp(rest) == 0:
-            break
-        size, near = float(np.max(np.abs(rest))), (float(np.min(rest)), float(np.max(rest)))
-        marks = [
-            end
-            for end, next_one in zip(ends, near, strict=True)
-            if abs(end - next_one) > (size if _is_usual(end) else FAR * size)
-            and (_is_usual(end) or np.sum(x == end) > 1)
-        ]
-        if not marks:
-            break
-        found += marks
-        x = x[~np.isin(x, marks)]
-    return found
+    low, high = (float(np.min(x)), float(np.max(x))) if x.size else (0.0, 0.0)
+    rest = x[(x != low) & (x != high)]
+    if rest.size < max(x.size / 2, 8) or np.ptp(rest) == 0:
+        return []
+    size = float(np.max(np.abs(rest)))
+    marks = []
+    for end, near in ((low, np.min(rest)), (high, np.max(rest))):
+        usual = _is_usual(end)
+        far = abs(end - near) > (size if usual else FAR * size)
+        if far and (usual or np.sum(x == end) > 1):
+            marks.append(end)
+    # behind them may be others: -9999 beside -99
+    return marks + _marks(x[~np.isin(x, marks)]) if marks else []
 
 
 def _is_usual(value: float) -> bool:
@@ -127,14 +119,12 @@ def _spikes(x: Float[np.ndarray, " there"]) -> Bool[np.ndarray, " there"]:
     odd = np.zeros(x.size, bool)
     if x.size < FEWEST:
         return odd
-    middle = scipy.ndimage.median_filter(x, NEIGHBOURS, mode="nearest")
-    away = x - middle
+    away = x - scipy.ndimage.median_filter(x, NEIGHBOURS, mode="nearest")
     distance = np.abs(away)
     level = min(tail_level(distance, max(LEAST_TOP, round(top * x.size))) for top in TOPS)
     hits = np.flatnonzero(distance > level)
-    for group in np.split(hits, np.flatnonzero(np.diff(hits) > APART) + 1) if hits.size else ():
-        if len(group) <= FEW and _is_alone(x, away, group):
-            odd[group] = True
+    for group in np.split(hits, np.flatnonzero(np.diff(hits) > APART) + 1):
+        odd[group] = 0 < len(group) <= FEW and _is_alone(x, away, group)
     return odd
 
 
@@ -166,6 +156,7 @@ def tail_level(sizes: Float[np.ndarray, " n"], top: int, chance: float = CHANCE)
         least = float(np.min(tail[tail > 0], initial=math.inf))
         if least == math.inf:
             return least
+    # the median, and not the mean: outliers in the tail itself must not widen it
     shape = float(np.median(np.log(np.maximum(tail, least) / least))) / math.log(2)
     return least * math.exp(max(shape, SHAPE) * (math.log(top) + chance))
 

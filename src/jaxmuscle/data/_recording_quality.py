@@ -14,7 +14,7 @@ from jaxmuscle._common.arguments import require
 from jaxmuscle._common.cards import Printed
 from jaxmuscle._common.files import nulled
 from jaxmuscle._common.tables import frame
-from jaxmuscle._common.text import digits
+from jaxmuscle._common.text import digits, listed
 from jaxmuscle.spectra._measures import Peaks
 
 if TYPE_CHECKING:
@@ -44,29 +44,24 @@ class RecordingSummary(Printed, eqx.Module):
     def rows(self) -> list[tuple[str, str]]:
         """Name and value of every number, as tables print them."""
         variation, top = self.coefficient_of_variation, self.peaks.maximum
-        local = ", ".join(f"{peak.interpolated:.3f}" for peak in self.peaks.local_maxima) or "none"
+        varies, above = digits(100 * variation), digits(self.signal_to_noise, 4)
+        if math.isnan(variation):
+            varies, above = "none, the mean is gravity or offset", "none"
+        elif variation >= 10:
+            varies = "none, the mean is near zero"
+        local = ", ".join(f"{peak.interpolated:.3f}" for peak in self.peaks.local_maxima)
         return [
             ("window (s)", f"{self.duration:.2f}"),
             ("Welch segments", f"{self.segments}"),
             (f"mean ({self.unit})", digits(self.mean, 4)),
             (f"standard deviation ({self.unit})", digits(self.standard_deviation, 4)),
-            (
-                "coefficient of variation (%)",
-                "none, the mean is gravity or offset"
-                if math.isnan(variation)
-                else digits(100 * variation)
-                if variation < 10
-                else "none, the mean is near zero",
-            ),
-            (
-                "mean over SD (signal-to-noise)",
-                "none" if math.isnan(variation) else digits(self.signal_to_noise, 4),
-            ),
+            ("coefficient of variation (%)", varies),
+            ("mean over SD (signal-to-noise)", above),
             ("approximate entropy", f"{self.approximate_entropy:.4f}"),
             ("sample entropy", f"{self.sample_entropy:.4f}"),
             ("maximum of the spectrum (Hz)", f"{top.interpolated:.3f}"),
             ("power in its bin (%)", digits(100 * top.power)),
-            ("local maxima (Hz)", local),
+            ("local maxima (Hz)", local or "none"),
         ]
 
     def __str__(self) -> str:
@@ -77,20 +72,14 @@ class RecordingSummary(Printed, eqx.Module):
 
         `quantity`, `value`, `unit`; of the peaks the frequency of the maximum, called `maximum`.
         """
-        units = {
-            "duration": "s",
-            "mean": self.unit,
-            "standard_deviation": self.unit,
-            "maximum": "Hz",
-        }
-        numbers = {
-            field.name: getattr(self, field.name) for field in dataclasses.fields(self)[1:-1]
-        }
-        numbers["maximum"] = self.peaks.maximum.interpolated
+        units = {"duration": "s", "maximum": "Hz"}
+        units |= dict.fromkeys(("mean", "standard_deviation"), self.unit)
+        numbers = vars(self) | {"maximum": self.peaks.maximum.interpolated}
         return frame(
             [
-                {"quantity": n, "value": float(v), "unit": units.get(n, "1")}
-                for n, v in numbers.items()
+                {"quantity": name, "value": float(value), "unit": units.get(name, "1")}
+                for name, value in numbers.items()
+                if name not in ("unit", "peaks")
             ]
         )
 
@@ -137,29 +126,28 @@ def filled(
     there = np.flatnonzero(~missing)
     if there.size == 0:
         raise ValueError("holds no number, only gaps (NaN or empty)")
-    first, last = int(there[0]), int(there[-1]) + 1
-    values, gaps, notices = values[first:last].copy(), runs(missing[first:last]), []
-    cut, begin = missing.size - values.shape[0], first / rate
+    kept, begin = slice(there[0], there[-1] + 1), float(there[0] / rate)
+    values, hole, notices = values[kept].copy(), missing[kept], []
+    cut = missing.size - hole.size
     if cut:
         notices.append(f"{cut} samples without a number at the ends cut off ({cut / rate:.3g} s)")
-    too_long = gaps[(gaps[:, 1] - gaps[:, 0]) / rate > longest]
-    if len(too_long):
-        spans = [f"{begin + a / rate:.3f} s to {begin + b / rate:.3f} s" for a, b in too_long[:5]]
-        more = f" and {len(too_long) - 5} more" if len(too_long) > 5 else ""
+    gaps = runs(hole) / rate
+    if not len(gaps):
+        return values, begin, notices
+    lengths = gaps[:, 1] - gaps[:, 0]
+    spans = [f"{begin + a:.3f} s to {begin + b:.3f} s" for a, b in gaps[lengths > longest]]
+    if spans:
         raise ValueError(
-            f"gaps longer than max_gap={longest:g} s at {', '.join(spans)}{more}; "
-            "cut the recording there, or allow more with `max_gap`"
+            f"gaps longer than max_gap={longest:g} s at {listed(spans, 5)};"
+            " cut the recording there, or allow more with `max_gap`"
         )
-    if len(gaps):
-        hole, index = missing[first:last], np.arange(last - first)
-        for part in values.T:
-            part[hole] = np.interp(index[hole], index[~hole], part[~hole])
-        widest = np.max(gaps[:, 1] - gaps[:, 0]) / rate
-        plural = "s" if len(gaps) > 1 else ""
-        notices.append(
-            f"{len(gaps)} gap{plural} ({hole.sum()} samples, longest {widest:.3g} s) closed by"
-            " straight lines"
-        )
+    index = np.arange(hole.size)
+    for part in values.T:
+        part[hole] = np.interp(index[hole], index[~hole], part[~hole])
+    count = f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''}"
+    notices.append(
+        f"{count} ({hole.sum()} samples, longest {np.max(lengths):.3g} s) closed by straight lines"
+    )
     return values, begin, notices
 
 
@@ -168,14 +156,12 @@ def clipping(x: Float[np.ndarray, " times"], rate: float, start: float) -> list[
     more."""
     shortest, notices = max(FLAT[0] * rate, FLAT[1]), []
     for word, extreme in (("highest", x.max()), ("lowest", x.min())):
-        flat = runs(x == extreme)
-        flat = flat[flat[:, 1] - flat[:, 0] >= shortest]
-        if len(flat):
-            share = np.mean(x == extreme)
-            first = start + flat[0, 0] / rate
+        flat = x == extreme
+        first = next((a for a, b in runs(flat) if b - a >= shortest), None)
+        if first is not None:
             notices.append(
-                f"flat at its {word} value {extreme:.6g} for {digits(100 * share, 2)} % of the"
-                f" samples, first at {first:.3f} s: clipped by the amplifier?"
+                f"flat at its {word} value {extreme:.6g} for {digits(100 * np.mean(flat), 2)} % of"
+                f" the samples, first at {start + first / rate:.3f} s: clipped by the amplifier?"
             )
     return notices
 
@@ -203,23 +189,21 @@ def plateau(x: Float[np.ndarray, " times"], rate: float) -> tuple[int, int] | No
     **Returns:** the two indices, or `None` if there is no such stretch.
     """
     s, size = running_median(x, rate), _size(x, rate)
-    low, high = float(s.min()), float(s.max())
-    if high - low <= RAMP * max(abs(low), abs(high)):
+    rest, far = sorted((float(s.min()), float(s.max())), key=abs)
+    if abs(far - rest) <= RAMP * abs(far):
         return 0, x.size
-    rest, far = (low, high) if abs(low) <= abs(high) else (high, low)
     beyond = (s - rest) / (far - rest) > 0.5
     level = float(np.median(s[beyond]))
     found = runs(np.abs(s - level) <= BAND * abs(level - rest))
-    if not len(found):
-        return None
-    start, stop = (int(i) for i in found[np.argmax(found[:, 1] - found[:, 0])])
+    start, stop = max(found.tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
     if stop - start < SHARE * np.sum(beyond):
         return None
+    # the median over 1 s knows of a ramp one half of it away; the other half is for a slow foot
     start, stop = start + size * (start > 0), stop - size * (stop < x.size)
     return (start, stop) if stop > start else None
 
 
-class _Rest(NamedTuple):
+class _Level(NamedTuple):
     """A level at an end of a signal, before the first ramp or after the last: from `begin` to `end`
     [s after the first sample]; its `scatter` is a standard deviation."""
 
@@ -265,53 +249,55 @@ def find_rest(x: Float[np.ndarray, " times"], rate: float) -> Rest | None:
         return None
     s = running_median(even, rate)
     height = float(np.ptp(s))
-    ends = [
-        end
-        for turned in (False, True)
-        if (end := _end(even[::-1] if turned else even, rate, height, turned)) is not None
-    ]
+    after = _first_level(even[::-1], rate, height)
+    if after is not None:  # which was found in time that runs backwards
+        long = even.size / rate
+        after = after._replace(begin=long - after.end, end=long)
+    ends = [end for end in (_first_level(even, rate, height), after) if end is not None]
     if not ends:
         return None
     best = min(ends, key=lambda end: end.scatter)
     same = [end for end in ends if abs(end.level - best.level) <= BAND * height]
-    above = even - best.level
-    found = plateau(above, rate)
-    if found not in (None, (0, even.size)):
-        hold = scipy.signal.detrend(above[slice(*found)])
-        scatter = float(np.std(hold))
-    else:
-        beyond = np.abs(s - best.level) > 0.5 * np.max(np.abs(s - best.level))
-        size = _size(even, rate)
-        pieces = even[beyond][: np.sum(beyond) // size * size].reshape(-1, size)
-        scatter = float(np.median(np.std(pieces, axis=1))) if pieces.size else 0.0
+    levels = [end.level for end in same]
+    scatter = _scatter_of_hold(even - best.level, s - best.level, rate)
     far = max((float(s.min()), float(s.max())), key=lambda edge: abs(edge - best.level))
-    spread = float(np.ptp([end.level for end in same]))
-    most = max(end.scatter for end in same)
     return Rest(
-        float(np.mean([end.level for end in same])),
-        most / scatter if scatter > 0 else math.inf,
+        float(np.mean(levels)),
+        max(end.scatter for end in same) / scatter if scatter > 0 else math.inf,
         same[0].begin,
         same[0].end,
         abs(best.level) <= max(NOTHING * height, NOISE * best.scatter),
-        spread <= AGREE * height,
+        float(np.ptp(levels)) <= AGREE * height,
         len(same) > 1 or abs(best.level) < abs(far),
     )
 
 
-def _end(x: Float[np.ndarray, " times"], rate: float, height: float, turned: bool) -> _Rest | None:
-    """The level with which a signal begins, if it leaves it; `turned`: of one that runs
-    backwards."""
+def _scatter_of_hold(
+    above: Float[np.ndarray, " times"], smooth: Float[np.ndarray, " times"], rate: float
+) -> float:
+    """The standard deviation of a signal and its running median above rest, while it is held."""
+    found = plateau(above, rate)
+    if found not in (None, (0, above.size)):
+        return float(np.std(scipy.signal.detrend(above[slice(*found)])))
+    beyond = above[np.abs(smooth) > 0.5 * np.max(np.abs(smooth))]
+    size = _size(above, rate)
+    pieces = beyond[: beyond.size // size * size].reshape(-1, size)
+    return float(np.median(np.std(pieces, axis=1))) if pieces.size else 0.0
+
+
+def _first_level(x: Float[np.ndarray, " times"], rate: float, height: float) -> _Level | None:
+    """The level with which a signal begins, if it leaves it."""
     least = max(round(SHORT * rate), 2)
     smooth = scipy.ndimage.median_filter(x, max(round(0.1 * rate), 1), mode="nearest")
     away = np.flatnonzero(np.abs(smooth - np.median(x[:least])) > LEFT * height)
     count = int(KEPT * away[0]) if away.size else 0
     if count < least:
         return None
-    slope = float(np.polyfit(np.arange(count), x[:count], 1)[0])
+    still = x[:count]
+    slope = float(np.polyfit(np.arange(count), still, 1)[0])
     if abs(slope) * count > 0.65 * LEFT * height:  # a slow ramp
         return None
-    span = ((x.size - count) / rate, x.size / rate) if turned else (0.0, count / rate)
-    return _Rest(float(np.mean(x[:count])), float(np.std(x[:count])), *span)
+    return _Level(float(np.mean(still)), float(np.std(still)), 0.0, count / rate)
 
 
 def without_rest(
@@ -336,10 +322,8 @@ def without_rest(
     rest = find_rest(x, rate)
     if rest is None or rest.zero:
         return x, []
-    when = ":".join(f"{round(start + edge, 2):g}" for edge in (rest.begin, rest.end))
-    said = (
-        f"{AT_REST}({when.replace(':', ' s to ')} s) the signal is {rest.level:.4g} {unit}, not 0"
-    )
+    begin, end = (f"{round(start + edge, 2):g}" for edge in (rest.begin, rest.end))
+    said = f"{AT_REST}({begin} s to {end} s) the signal is {rest.level:.4g} {unit}, not 0"
     if rest.quiet:
         keep = '--baseline none keeps it (in Python baseline = "none")'
         return x - rest.level, [f"{said}. This was subtracted; {keep}"]
@@ -350,10 +334,9 @@ def without_rest(
         if rest.agree
         else "it differs before and after the hold"
     )
-    edges = when.replace(":", ", ")
     return x, [
         f"{said}. This was not subtracted: {why}. If it is the sensor's zero, give --baseline"
-        f" {when} (in Python baseline = ({edges})); if not, --baseline none"
+        f" {begin}:{end} (in Python baseline = ({begin}, {end})); if not, --baseline none"
     ]
 
 
@@ -378,12 +361,9 @@ def checked(samples: Any, rate: float, start: float) -> Float[np.ndarray, " all"
         x = np.array(samples, dtype=float)
     except (TypeError, ValueError):
         raise ValueError("samples: give real numbers, one for each time") from None
-    require(
-        x.ndim == 1 and x.size >= 2,
-        "samples shape",
-        x.shape,
-        "give one signal of 2 samples or more",
-    )
+    remedy = "give one signal of 2 samples or more"
+    require(x.ndim == 1 and x.size >= 2, "samples shape", x.shape, remedy)
+    # what is larger is no measurement either, and its square is none
     wrong = np.flatnonzero(~(np.abs(x) < 1e100))
     if wrong.size:
         first = f"the first at {start + wrong[0] / rate:.3f} s ({x[wrong[0]]:g})"

@@ -15,14 +15,9 @@ from jaxmuscle._common.text import printable
 from ._recording_channels import Channel, numbers
 from ._units import name_and_unit, quantity_of, seconds
 
-TRIPLES = (
-    ("_x", "_y", "_z"),
-    (".x", ".y", ".z"),
-    (" x", " y", " z"),
-    (":x", ":y", ":z"),
-    ("x", "y", "z"),
-    (":0", ":1", ":2"),
-)
+TRIPLES = [[f"{sign}{axis}" for axis in "xyz"] for sign in ("_", ".", " ", ":", "")] + [
+    [":0", ":1", ":2"]
+]
 AXES = ("x", "y", "z")
 _COORDINATE = re.compile(r"[_.: ][xyz]$", re.IGNORECASE)
 
@@ -63,28 +58,23 @@ class Table(NamedTuple):
 
 def channels_table(file: str, channels: Sequence[Channel], *, named: bool = True) -> Table:
     """The channels that a reader found in a file."""
-    columns = {
-        channel.name: functools.partial(np.asarray, channel.samples, dtype=float)
-        for channel in channels
-    }
-    rates = {channel.name: channel.rate for channel in channels if channel.rate is not None}
-    # of a struct that states no rate
-    times = {
-        stem: name
-        for name in columns
-        for stem, _, last in [name.rpartition(".")]
-        if stem and last.casefold() in ("time", "t")
-    }
+    # a struct that states no rate may hold its times beside the signals
+    times: dict[str, str] = {}
+    for channel in channels:
+        struct, _, last = channel.name.rpartition(".")
+        if struct and last.casefold() in ("time", "t"):
+            times[struct] = channel.name
     clocks = {
-        name: time
-        for name in columns
-        if name not in rates and (time := times.get(name.rpartition(".")[0])) not in (None, name)
+        channel.name: time
+        for channel in channels
+        if channel.rate is None
+        and (time := times.get(channel.name.rpartition(".")[0])) not in (None, channel.name)
     }
     return Table(
         file,
-        columns,
+        {each.name: functools.partial(np.asarray, each.samples, dtype=float) for each in channels},
         named,
-        rates,
+        {channel.name: channel.rate for channel in channels if channel.rate is not None},
         {channel.name: channel.unit for channel in channels if channel.unit},
         clocks=clocks,
         aliases={channel.alias: channel.name for channel in channels if channel.alias},
@@ -126,26 +116,25 @@ def frame_table(frame: Any) -> Table:
             f"frame={type(frame).__name__}: give a pandas DataFrame, a single column as"
             " frame.to_frame()"
         )
-    index = frame.index
-    counter = index.dtype.kind not in "fmM" and index.name is None
-    given = [] if counter else [(str(index.name or "time"), index)]
-    given += [
-        (" ".join(map(str, key)) if isinstance(key, tuple) else str(key), frame.iloc[:, i])
-        for i, key in enumerate(frame.columns)
-    ]
-    names = [name for name, _ in given]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None or frame.empty:
-        raise ValueError(
-            "the table is empty"
-            if frame.empty
-            else f"the table has two columns {twice!r}; rename one"
-        )
-    columns = {name: lambda column=column: numbers(column.to_numpy()) for name, column in given}
+    if frame.empty:
+        raise ValueError("the table is empty")
+    index, keys = frame.index, [key if isinstance(key, tuple) else (key,) for key in frame.columns]
+    given = [(" ".join(map(str, key)), frame.iloc[:, i]) for i, key in enumerate(keys)]
+    if index.dtype.kind in "fmM" or index.name is not None:
+        given.insert(0, (str(index.name or "time"), index))
+    columns = dict(given)
+    if len(columns) < len(given):
+        names = [name for name, _ in given]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the table has two columns {twice!r}; rename one")
     kinds = {name: column.dtype.kind for name, column in given}
-    units = units_of(names) | {name: "s" for name, kind in kinds.items() if kind in "mM"}
-    words = frozenset(name for name, kind in kinds.items() if kind not in "iufbmM")
-    return Table("the table", columns, True, {}, units, words, "row {}".format)
+    return Table(
+        "the table",
+        {name: lambda column=column: numbers(column.to_numpy()) for name, column in given},
+        units=units_of(columns) | {name: "s" for name, kind in kinds.items() if kind in "mM"},
+        words=frozenset(name for name, kind in kinds.items() if kind not in "iufbmM"),
+        place="row {}".format,
+    )
 
 
 def bare(name: str) -> str:
@@ -170,11 +159,9 @@ def listed(names: Iterable[str]) -> str:
     groups: dict[str, list[str]] = {}
     for name in sorted(names, key=lambda name: _COORDINATE.search(name) is not None):
         stem, _, index = name.rpartition(":")
-        groups.setdefault(stem if stem and index.isdigit() else name, []).append(name)
-    groups = {stem: [repr(n) if ", " in n else n for n in group] for stem, group in groups.items()}
-    short = [
-        group[0] if len(group) == 1 else f"{group[0]} to {group[-1]}" for group in groups.values()
-    ]
+        quoted = repr(name) if ", " in name else name
+        groups.setdefault(stem if stem and index.isdigit() else name, []).append(quoted)
+    short = [" to ".join(dict.fromkeys((group[0], group[-1]))) for group in groups.values()]
     return ", ".join(short[:30]) + (f" ... ({len(short)} in all)" if len(short) > 30 else "")
 
 
@@ -184,33 +171,26 @@ def find(table: Table, column: str | int, argument: str = "column") -> str:
 
     **Raises:** `ValueError` with the nearest name and all names.
     """
-    names = list(table.columns)
-    exact = _find(names, column)
-    if exact is None and table.aliases:
-        exact = _find(list(table.aliases), column)
-        exact = None if exact is None else table.aliases[exact]
-    if exact is not None:
-        return exact
-    stem = str(column).casefold()
+    names, fault = list(table.columns), f"{table.file}: {argument}={column!r}"
+    found = _find(names, column) or table.aliases.get(_find(list(table.aliases), column) or "")
+    if found is not None:
+        return found
     if triple(table, str(column)) is not None:
         raise ValueError(
-            f"{table.file}: {argument}={column!r} is a point of three columns; give axis='x', 'y',"
-            " 'z' or 'principal'"
+            f"{fault} is a point of three columns; give axis='x', 'y', 'z' or 'principal'"
         )
-    if any(name.casefold() == f"{stem}:0" for name in (*names, *table.aliases)):
-        raise ValueError(
-            f"{table.file}: {argument}={column!r} has several columns; choose one, as {column}:0"
-            " (counted from 0)"
-        )
+    first = f"{column}:0"
+    if any(name.casefold() == first.casefold() for name in (*names, *table.aliases)):
+        raise ValueError(f"{fault} has several columns; choose one, as {first} (counted from 0)")
     near = difflib.get_close_matches(str(column), names, n=1, cutoff=0.4)
     hint = f"did you mean {near[0]!r}? " if near else ""
     raise ValueError(f"{table.file}: no {argument} {column!r}; {hint}Known: {listed(names)}")
 
 
 def _find(names: list[str], column: str | int) -> str | None:
+    if column in names:
+        return str(column)
     if isinstance(column, str):
-        if column in names:
-            return column
         loose = [name for name in names if bare(name) == bare(column)]
         if len(loose) == 1:
             return loose[0]
@@ -218,37 +198,35 @@ def _find(names: list[str], column: str | int) -> str | None:
         mine = [name for name in names if name.rpartition(":")[0] == stem and stem]
         if mine and re.fullmatch(r"-\d+", index) and int(index) >= -len(mine):
             return mine[int(index)]
-    if isinstance(column, int) or re.fullmatch(r"-?\d+", column):
-        index = int(column)
-        return names[index] if -len(names) <= index < len(names) else None
-    return None
+        if not re.fullmatch(r"-?\d+", column):
+            return None
+    return names[int(column)] if -len(names) <= int(column) < len(names) else None
 
 
 def triple(table: Table, stem: str) -> list[str] | None:
     """The three columns of the point with that name, if there are such."""
     known = {bare(name): name for name in table.columns}
-    for suffixes in TRIPLES:
-        wanted = [f"{stem}{suffix}".casefold() for suffix in suffixes]
-        # Four columns NAME:0 to NAME:3 are a table.
-        if all(name in known for name in wanted) and f"{stem}:3".casefold() not in known:
-            return [known[name] for name in wanted]
-    return None
+    if f"{stem}:3".casefold() in known:  # a table of four columns or more
+        return None
+    each = ([f"{stem}{suffix}".casefold() for suffix in suffixes] for suffixes in TRIPLES)
+    return next(([known[n] for n in wanted] for wanted in each if known.keys() >= {*wanted}), None)
 
 
 def points(table: Table) -> list[str]:
     """Names of all points: what three columns have in common."""
-    found: dict[str, None] = {}
-    for name in map(bare, table.columns):
-        for first, _, _ in TRIPLES:
-            stem = name.removesuffix(first)
-            # NAME_x ends in x as well, but its point is NAME.
-            if (
-                stem != name
-                and stem[-1:] not in ("", "_", ".", ":", " ")
-                and triple(table, stem) is not None
-            ):
-                found[stem] = None
-    return list(found)
+    ends = tuple(first for first, _, _ in TRIPLES)
+    stems = dict.fromkeys(
+        name.removesuffix(end)
+        for name in map(bare, table.columns)
+        for end in ends
+        if name.endswith(end)
+    )
+    # NAME_x ends in x as well, but its point is NAME.
+    return [
+        stem
+        for stem in stems
+        if stem and stem[-1] not in "_.: " and triple(table, stem) is not None
+    ]
 
 
 def values(table: Table, names: Iterable[str]) -> Float[np.ndarray, "rows columns"]:
@@ -256,16 +234,18 @@ def values(table: Table, names: Iterable[str]) -> Float[np.ndarray, "rows column
 
     **Raises:** `ValueError` for unequal lengths, and an infinite value with its place.
     """
-    names = list(names)
-    parts = [table.columns[name]() for name in names]
-    for name, part in zip(names, parts, strict=True):
-        if part.size != parts[0].size:
-            sizes = f"{names[0]} has {parts[0].size} samples, {name} {part.size}"
-            raise ValueError(f"{table.file}: {sizes}; give columns of one length")
+    parts = {name: table.columns[name]() for name in names}
+    first, rows = next((name, part.size) for name, part in parts.items())
+    for name, part in parts.items():
+        if part.size != rows:
+            raise ValueError(
+                f"{table.file}: {first} has {rows} samples, {name} {part.size}; give columns of one"
+                " length"
+            )
         wrong = np.flatnonzero(np.isinf(part))
         if wrong.size:
             raise ValueError(
                 f"{table.file}, {table.place(int(wrong[0]))}: {name} is infinite; leave it empty if"
                 " it is not known"
             )
-    return np.stack(parts, axis=1)
+    return np.stack([*parts.values()], axis=1)

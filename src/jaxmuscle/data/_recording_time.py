@@ -10,7 +10,8 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-from jaxmuscle._common.arguments import require
+from jaxmuscle._common.arguments import is_real, require
+from jaxmuscle._common.text import listed
 
 from ._recording_table import Table, bare, find
 from ._units import name_and_unit, seconds
@@ -42,7 +43,7 @@ class Clock(NamedTuple):
 
     name: str
     scale: float | None
-    guessed: bool
+    guessed: bool = False
     used: bool = True
 
 
@@ -77,11 +78,10 @@ class Part(NamedTuple):
         for column, found in zip(x.T, even.T, strict=True):
             there = ~np.isnan(column)
             t, y = _merged(at[there], column[there])
-            if len(t) < 2:
-                continue
-            after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
-            inside = (t[after] - t[after - 1] <= WIDE) & (grid >= t[0]) & (grid <= t[-1])
-            found[inside] = scipy.interpolate.CubicSpline(t, y)(grid[inside])
+            if len(t) >= 2:
+                after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
+                near = t[after] - t[after - 1] <= WIDE
+                found[near] = scipy.interpolate.CubicSpline(t, y, extrapolate=False)(grid[near])
         return even
 
 
@@ -111,19 +111,12 @@ def clock(table: Table, asked: str | int | None = None, column: str | None = Non
     if str(asked).casefold() == "none" and asked not in (None, *table.columns):
         found = clock(table, None, column)
         return None if found is None else found._replace(used=False)
-    if asked is not None:
-        name = find(table, asked, "time")
-        return Clock(name, _scale(table, name), False)
-    own = table.clocks.get(column or "")
-    if own is not None:
-        return Clock(own, _scale(table, own), False)
-    called = [name for name in table.columns if _TIME.fullmatch(bare(name))]
-    timed = [
-        *called,
-        *(name for name in table.columns if seconds(table.units.get(name)) is not None),
-    ]
-    if timed:
-        return Clock(timed[0], _scale(table, timed[0]), False)
+    own = table.clocks.get(column or "") if asked is None else find(table, asked, "time")
+    called = (name for name in table.columns if _TIME.fullmatch(bare(name)))
+    timed = (name for name in table.columns if seconds(table.units.get(name)) is not None)
+    name = own or next(itertools.chain(called, timed), None)
+    if name is not None:
+        return Clock(name, _scale(table, name))
     first = next(iter(table.columns))
     if table.rates or len(table.columns) < 2 or first in (*table.units, *table.words):
         return None
@@ -133,7 +126,7 @@ def clock(table: Table, asked: str | int | None = None, column: str | None = Non
     steps = np.diff(time)
     usual = float(np.median(steps))
     even = _departure(time)[0] or np.mean(np.abs(steps - usual) < 0.5 * usual) > 0.9
-    return Clock(first, None, True) if even and usual != 1 else None  # steps of 1 are a counter
+    return Clock(first, None, guessed=True) if even and usual != 1 else None  # 1: a counter
 
 
 def _scale(table: Table, name: str) -> float | None:
@@ -158,10 +151,8 @@ def sampling(
     **Raises:** `ValueError` if there is no rate, and if the rate given contradicts the times.
     """
     if rate is not None:
-        number = isinstance(rate, int | float | np.number) and not isinstance(rate, bool)
-        require(
-            number and 0 < rate < math.inf, "rate", rate, "give samples per second [Hz], above 0"
-        )
+        remedy = "give samples per second [Hz], above 0"
+        require(is_real(rate) and rate > 0, "rate", rate, remedy)
     stated = table.rates.get(name)
     words: list[str] = []
     if time is not None and time.name != name:
@@ -169,7 +160,6 @@ def sampling(
             words = [f"the times in column {time.name} are left out as asked: rows count as even"]
         elif table.columns[time.name]().size == rows >= 2:
             return _timed(table, time, rate, longest)
-    whole = [Part(0.0, slice(0, rows))]
     if rate is None and stated is None:
         why = "time='none' leaves the times out" if words else "no time column found"
         raise ValueError(
@@ -177,7 +167,7 @@ def sampling(
         )
     if rate is not None and stated is not None and abs(rate / stated - 1) > RATE_TOLERANCE:
         words.append(f"rate {rate:g} Hz as asked; the file states {stated:g} Hz")
-    return Sampling(float(rate or stated or 0.0), words, whole)
+    return Sampling(float(rate or stated or 0.0), words, [Part(0.0, slice(0, rows))])
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of times that no recording has: they are refused
@@ -237,23 +227,28 @@ def _usual(time: Float[np.ndarray, " rows"]) -> float:
 
 
 def _check_rising(table: Table, clock: Clock, raw: Float[np.ndarray, " rows"]) -> None:
-    steps, where = np.diff(raw, prepend=raw[0]), f"time column {clock.name!r}"
-    for wrong, what in (
-        (~np.isfinite(raw), "holds no number"),
-        (steps < 0, "runs backwards"),
-    ):
-        at = int(np.argmax(wrong))
-        if np.any(wrong):
-            jump = f", from {raw[at - 1]:.{FIGURES}g} to {raw[at]:.{FIGURES}g}" * bool(
-                steps[at] < 0
-            )
-            again = bool(steps[at] < 0 and raw[at] <= raw[0] + 0.1 * (raw[at - 1] - raw[0]))
-            second = "a second recording may begin there: save each on its own. Or " * again
-            raise ValueError(
-                f"{table.file}, {table.place(at)}: {where} {what}{jump}; {second}{_REMEDY}"
-            )
+    """**Raises:** `ValueError` naming the line of a time that is none, or before the last one."""
+    lost, back = ~np.isfinite(raw), np.diff(raw, prepend=raw[0]) < 0
+    at = int(np.argmax(lost if np.any(lost) else back))
+    if back[at]:
+        begin, before, now = raw[0], raw[at - 1], raw[at]
+        fault = f"runs backwards, from {before:.{FIGURES}g} to {now:.{FIGURES}g}; "
+        if now <= begin + 0.1 * (before - begin):
+            fault += "a second recording may begin there: save each on its own. Or "
+        raise _fault(table, clock, at, fault)
+    if lost[at]:
+        raise _fault(table, clock, at, "holds no number; ")
     if not raw[-1] > raw[0]:
-        raise ValueError(f"{table.file}: {where} stands still at {raw[0]:g}; {_REMEDY}")
+        raise ValueError(
+            f"{table.file}: time column {clock.name!r} stands still at {raw[0]:g}; {_REMEDY}"
+        )
+
+
+def _fault(table: Table, clock: Clock, row: int, words: str) -> ValueError:
+    """What is wrong with the time in a row."""
+    return ValueError(
+        f"{table.file}, {table.place(row)}: time column {clock.name!r} {words}{_REMEDY}"
+    )
 
 
 def _unit_of(
@@ -272,16 +267,12 @@ def _unit_of(
     if clock.scale is not None:
         return clock.scale, []
     rates = {unit: 1 / (scale * usual) if usual > 0 else 0.0 for unit, scale in READINGS.items()}
-    steps = np.diff(raw)
-    whole = bool(np.all(raw == np.round(raw)) and usual == round(usual))
-    counts = whole and bool(np.all(steps % usual == 0)) and usual < 2 * SLOWEST
+    whole = np.all(raw == np.round(raw)) and usual == round(usual) and usual < 2 * SLOWEST
+    counts = bool(whole and np.all(np.diff(raw) % usual == 0))
     by_rate = [unit for unit in rates if rate and abs(rates[unit] / rate - 1) <= LOOSE]
-    dated = [
-        unit
-        for unit, scale in READINGS.items()
-        if EPOCH[0] <= raw[0] * scale <= EPOCH[1] and rates[unit] >= 1
-    ]
-    small = [u for u in list(READINGS)[1:] if SLOWEST <= rates[u] <= FASTEST]
+    begin, end = EPOCH
+    dated = [u for u in rates if begin <= raw[0] * READINGS[u] <= end and rates[u] >= 1]
+    small = [u for u in rates if u != "s" and SLOWEST <= rates[u] <= FASTEST]
     as_seconds = 10 <= rates["s"] <= 1e6
     unit = [*by_rate, *([] if as_seconds else dated + small), "s"][0]
     if not by_rate and rate and usual == 1 and counts:
@@ -294,12 +285,10 @@ def _unit_of(
             f"{table.file}: column {clock.name}: times look like {look} ({raw.size} rows, step"
             f" {usual:g}): {named}give rate={float(f'{rates[unit]:.6g}'):g}"
         )
-    if clock.guessed:
-        return READINGS[unit], [
-            f"column {clock.name} rises evenly and is taken as the time in {unit}"
-        ]
-    said = f"column {clock.name} states no unit and is taken as {unit} (step {usual:.6g})"
-    return READINGS[unit], [said] * (unit != "s")
+    words = f"column {clock.name} rises evenly and is taken as the time in {unit}"
+    if not clock.guessed:
+        words = f"column {clock.name} states no unit and is taken as {unit} (step {usual:.6g})"
+    return READINGS[unit], [words] * (clock.guessed or unit != "s")
 
 
 def _placed(
@@ -324,13 +313,9 @@ def _placed(
     elif np.any(steps == 0) and (
         coarse < TOGETHER * usual or np.mean(np.abs(steps - usual) > JITTER * usual) < RARE
     ):
-        at = int(np.argmax(steps == 0)) + 1
-        raise ValueError(
-            f"{table.file}, {table.place(at)}: time column {clock.name!r} has the time of the row"
-            f" before again; if the row stands there twice, take one out. Or {_REMEDY}"
-        )
-    interval, ends = float(np.median(steps)), steps > longest + usual
-    near = steps[~ends]
+        words = "has the time of the row before again; if the row stands there twice, take one out."
+        raise _fault(table, clock, int(np.argmax(steps == 0)) + 1, f"{words} Or ")
+    interval, near = float(np.median(steps)), steps[steps <= longest + usual]
     for _ in range(2):  # the second round counts the rows in long gaps rightly
         interval = float(np.sum(near) / max(np.sum(np.round(near / interval)), 1))
     if not np.mean(np.abs(steps / interval - 1) <= 0.6) > 0.5:
@@ -340,21 +325,19 @@ def _placed(
             f" ({table.place(at)}) comes {time[at + 1]:.6g} s, on average {interval:.6g} s lie"
             f" between two; {_REMEDY}"
         )
-    ends = steps - interval > max(longest, 0.75 * interval)
     parts = []
-    for rows in _slices(ends):
-        position = (time[rows] - time[rows.start]) / interval
+    tolerance = min(JITTER + rounding / interval, 0.45)
+    for rows in _slices(steps - interval > max(longest, 0.75 * interval)):
+        start = float(time[rows.start])
+        position = (time[rows] - start) / interval
+        # the first row may itself be late: the grid lies where most rows are
         whole = np.round(position - np.median(position - np.round(position))).astype(int)
-        tolerance = min(JITTER + rounding / interval, 0.45)
-        off = position - whole
-        even = np.ptp(off) <= 2 * tolerance and np.all(np.diff(whole) >= 1)
-        parts.append(Part(float(time[rows.start]), rows, whole - whole[0] if even else position))
+        even = np.ptp(position - whole) <= 2 * tolerance and np.all(np.diff(whole) >= 1)
+        parts.append(Part(start, rows, whole - whole[0] if even else position))
     if _is_uneven(parts):  # steps are no multiples, so none can be counted
         interval = float(np.mean(steps[np.abs(steps - usual) < 0.5 * usual]))
-        parts = [
-            part._replace(position=(time[part.rows] - part.start) / interval) for part in parts
-        ]
-    return interval, *_with_words(parts, time)
+        parts = [p._replace(position=(time[p.rows] - p.start) / interval) for p in parts]
+    return interval, parts, _words_of(parts, time)
 
 
 def _slices(ends: np.ndarray) -> list[slice]:
@@ -363,28 +346,26 @@ def _slices(ends: np.ndarray) -> list[slice]:
     return [slice(a, b) for a, b in itertools.pairwise(edges)]
 
 
-def _with_words(
-    parts: list[Part], time: Float[np.ndarray, " rows"]
-) -> tuple[list[Part], list[str]]:
-    """The parts, and what to say of missing rows and of pauses."""
-    uneven, words = _is_uneven(parts), []
-    holes = [(p, np.diff(np.asarray(p.position))) for p in parts]
-    least = WIDE if uneven else 1
-    missing = round(sum(float(np.sum(np.round(d[d > least]) - 1)) for _, d in holes))
+def _words_of(parts: list[Part], time: Float[np.ndarray, " rows"]) -> list[str]:
+    """What to say of missing rows and of pauses."""
+    words, missing, first = [], 0, math.inf
+    least = WIDE if _is_uneven(parts) else 1
+    for part in parts:
+        steps = np.diff(np.asarray(part.position))
+        holes = np.flatnonzero(steps > least)
+        if holes.size:
+            missing += round(float(np.sum(np.round(steps[holes]) - 1)))
+            first = min(first, time[part.rows.start + holes[0]])
     if missing:
-        first = min(
-            time[p.rows.start + int(np.argmax(d > least))] for p, d in holes if np.any(d > least)
-        )
         are = "row is" if missing == 1 else "rows are"
         words.append(f"{missing} {are} missing in the times, the first after {first:.3f} s")
     if len(parts) > 1:
         spans = [f"{time[p.rows.start]:.6g}:{time[p.rows.stop - 1]:.6g}" for p in parts]
-        more = f" and {len(spans) - 5} more" if len(spans) > 5 else ""
         words.append(
-            f"the times pause: the recording is cut into the parts {', '.join(spans[:5])}{more} s."
+            f"the times pause: the recording is cut into the parts {listed(spans, 5)} s."
             " The longest is taken, unless the window lies in another"
         )
-    return parts, words
+    return words
 
 
 def _in_packets(
@@ -425,9 +406,8 @@ def _in_packets(
         Part(float(position[rows.start] * interval), rows, position[rows] - position[rows.start])
         for rows in _slices(missing[1:] * interval > longest)
     ]
-    parts, words = _with_words(parts, position * interval)
     head = f"rows come {size:g} at a time: they count as even, at {_rounded(1 / interval):.6g} Hz"
-    return interval, parts, [head, *words]
+    return interval, parts, [head, *_words_of(parts, position * interval)]
 
 
 def _rounded(rate: float) -> float:
@@ -444,19 +424,15 @@ def _simple(rate: float) -> float:
 def _departure(time: Float[np.ndarray, " rows"], fine: float = 1e-12) -> tuple[bool, float, float]:
     """Whether the times are even, the mean interval, and the unit of their last decimal."""
     interval = float(time[-1] - time[0]) / (time.size - 1)
-    rounding = next(
-        (10.0**-d for d in range(9) if np.max(np.abs(time - np.round(time, d))) <= fine), 0.0
-    )
+    decimals = (d for d in range(9) if np.max(np.abs(time - np.round(time, d))) <= fine)
+    rounding = next((10.0**-d for d in decimals), 0.0)
     steps = np.diff(time)
     uneven = np.flatnonzero(np.abs(steps - np.median(steps)) > rounding / 2)
     # One or two odd steps are lost samples, and so are more, if all are long and they come now and
     # then: those of rounding come regularly. A step as coarse as many intervals is no rounding
     # either.
-    lost = uneven.size <= 2 or (
-        np.all(steps[uneven] > interval)
-        and np.ptp(np.diff(uneven)) > 2
-        and uneven.size < RARE * steps.size
-    )
+    rare = uneven.size < RARE * steps.size and np.all(steps[uneven] > interval)
+    lost = uneven.size <= 2 or (rare and np.ptp(np.diff(uneven)) > 2)
     rounding = 0.0 if lost or rounding > 5 * interval else rounding
     departure = np.max(np.abs(time - time[0] - interval * np.arange(time.size)))
     return bool(departure <= JITTER * interval + rounding), interval, rounding

@@ -1,7 +1,7 @@
 """How steady a held force is: a report of one recording or of several trials, without any model."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,7 @@ from ._measured import (
 )
 from ._measured_text import measured_lines, range_words
 from ._recording import SEGMENTS, SHORTEST, Recording, notices_of, unlike
+from ._trials import Trials
 
 if TYPE_CHECKING:
     import pandas
@@ -113,32 +114,27 @@ class Steadiness(Printed, Result, eqx.Module):
         return plot.steadiness(self, ax)
 
     def __str__(self) -> str:
-        count, seconds = len(self.trials), sorted(self.durations.values())
-        long = f"{seconds[0]:.3g} s" + (
-            f" to {seconds[-1]:.3g} s each" if seconds[-1] > 1.01 * seconds[0] else ""
-        )
+        count, seconds = len(self.trials), self.durations.values()
+        short, long = min(seconds), max(seconds)
+        lasted = f"{short:.3g} s" + f" to {long:.3g} s each" * (long > 1.01 * short)
         what = f"{count} trials" if count > 1 else next(iter(self.trials))
-        return folded(
-            [
-                f"Steadiness of {what}: {self.quantity or 'signal'} [{self.unit}], {long}",
-                *measured_lines(self.measures, self.band),
-                _of_errors(count),
-                PEAK + UNSEEN * math.isnan(self.measures["tremor_frequency"].value),
-                *(f"notice: {notice}" for notice in self.notices),
-            ]
-        )
+        head = f"Steadiness of {what}: {self.quantity or 'signal'} [{self.unit}], {lasted}"
+        unseen = UNSEEN if math.isnan(self.measures["tremor_frequency"].value) else ""
+        notices = [f"notice: {notice}" for notice in self.notices]
+        numbers = measured_lines(self.measures, self.band)
+        return folded([head, *numbers, _errors_in_words(count), PEAK + unseen, *notices])
 
 
-def _of_errors(count: int) -> str:
+def _errors_in_words(count: int) -> str:
     """What the errors contain."""
-    if count < ENOUGH:
-        return (
-            f"± is the standard error. It is estimated within {'the' if count == 1 else 'each'}"
-            " recording: for entropies and DFA from its four parts, for tremor and median frequency"
-            " from its Welch segments, for all else from its spectrum. So it does not say how the"
-            " next recording differs: between trials of one person we saw about twice as much."
-        )
-    return f"± is the standard error, from the scatter between the {count} trials."
+    if count >= ENOUGH:
+        return f"± is the standard error, from the scatter between the {count} trials."
+    return (
+        f"± is the standard error. It is estimated within {'the' if count == 1 else 'each'}"
+        " recording: for entropies and DFA from its four parts, for tremor and median frequency"
+        " from its Welch segments, for all else from its spectrum. So it does not say how the"
+        " next recording differs: between trials of one person we saw about twice as much."
+    )
 
 
 def _plain(measures: dict[str, Measure]) -> dict[str, Any]:
@@ -219,61 +215,47 @@ def steadiness(
     **Raises:** `ValueError` for no recordings, different units, a window that is constant or
     shorter than 3.84 s.
     """  # noqa: E501 (a row of a table is one line)
-    each = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    require(len(each) > 0, "recordings", each, "give at least one Recording")
+    each = Trials([recordings] if isinstance(recordings, Recording) else recordings).recordings
     for recording in each:
-        require(
-            isinstance(recording, Recording),
-            "recordings",
-            recording,
-            "load_recording(...) reads a file",
-        )
         recording._require_change()
         remedy = f"{recording.name} lasts {recording.duration:.3g} s; give at least {SHORTEST:g} s"
         require(recording.segments() >= SEGMENTS, "window", recording.window, remedy)
-    _same_unit(each)
-    names = [recording.name for recording in each]
+    given = [*(recording.name for recording in each), ALL]
     names = [
-        name if [*names, ALL].count(name) == 1 else f"{name} {i}"
-        for i, name in enumerate(names, start=1)
+        name if given.count(name) == 1 else f"{name} {i}" for i, name in enumerate(given[:-1], 1)
     ]
-    durations = {name: recording.duration for name, recording in zip(names, each, strict=True)}
+    durations = dict(zip(names, (recording.duration for recording in each), strict=True))
     signals = [recording.filtered() for recording in each]
-    quantity, highest = each[0].quantity, min(recording.rate for recording in each) / 2
+    unit, quantity, few = each[0].unit, each[0].quantity, len(each) < ENOUGH
+    highest = min(recording.rate for recording in each) / 2
     usual = searched_band(quantity, highest)
     band = usual if band is None else (float(band[0]), float(band[1]))
-    own, together = measure_signals(signals, each[0].unit, quantity, band, highest)
+    own, together = measure_signals(signals, unit, quantity, band, highest)
+    own = list(own)
     if mvc is not None:
         mean = abs(together[MEAN].value)
         require(mean <= mvc < math.inf, "mvc", mvc, f"give a force above the mean, {mean:.4g}")
         own, together = [_with_level(m, mvc) for m in own], _with_level(together, mvc)
     trials = dict(zip(names, own, strict=True))
-    said = notices_of(each, signals, float(RECORDED.rate), [()] * len(each), each[0].quantity)
-    if (
-        len(each) < ENOUGH
-        and each[0].quantity in ("force", "torque")
-        and unlike(names, signals, each[0].unit)
-    ):
-        said = (
-            *said,
-            "the errors do not contain how much two trials differ: for that give three or more",
+    notices = [*notices_of(each, signals, float(RECORDED.rate), quantity)]
+    if few and quantity in ("force", "torque") and unlike(names, signals, unit):
+        notices.append(
+            "the errors do not contain how much two trials differ: for that give three or more"
         )
-    if len(each) < ENOUGH:
-        said = (*said, *_notice_wandering(signals))
-    notices = (*said, *_mind(durations, together, list(trials.values()), quantity, highest))
-    unit = each[0].unit
-    return Steadiness(together, trials, durations, unit, quantity, band, notices)
+    notices += _notice_wandering(signals) if few else ()
+    notices += _notice_limits(durations, together, quantity, highest)
+    notices += () if few else _notice_agreement(own)
+    return Steadiness(together, trials, durations, unit, quantity, band, tuple(notices))
 
 
 def _with_level(measures: dict[str, Measure], mvc: float | int) -> dict[str, Measure]:
     """The measures with the mean over that of a maximal contraction behind it."""
-    mean, *others = measures.items()
-    value, stderr, _, error_from, interval = vars(mean[1]).values()
-    scale = math.copysign(1 / mvc, value)
-    low, high = sorted(scale * end for end in interval or (math.nan, math.nan))
-    error, ends = None if stderr is None else stderr / mvc, interval and (low, high)
-    level = Measure(scale * value, error, "1", error_from, ends)
-    return dict([mean, (LEVEL_NAME, level), *others])
+    (name, mean), *others = measures.items()
+    scale = math.copysign(1 / mvc, mean.value)
+    low, high = sorted(scale * end for end in mean.interval or (math.nan, math.nan))
+    error = None if mean.stderr is None else mean.stderr / mvc
+    level = Measure(scale * mean.value, error, "1", mean.error_from, mean.interval and (low, high))
+    return dict([(name, mean), (LEVEL_NAME, level), *others])
 
 
 def _notice_wandering(signals: list[np.ndarray]) -> tuple[str, ...]:
@@ -295,24 +277,13 @@ def _notice_wandering(signals: list[np.ndarray]) -> tuple[str, ...]:
     )
 
 
-def _same_unit(each: list[Recording]) -> None:
-    units = {recording.unit: recording.name for recording in reversed(each)}
-    told = ", ".join(f"{name} in {unit}" for unit, name in units.items())
-    remedy = (
-        "convert them to one unit (Recording(1e-3 * samples, rate, unit=...)), or report on each"
-        " unit by itself"
-    )
-    if len(units) > 1:
-        raise ValueError(f"recordings: units differ ({told}); {remedy}")
-
-
-def _mind(
+def _notice_limits(
     durations: dict[str, float],
     together: dict[str, Measure],
-    own: list[dict[str, Measure]],
     quantity: str | None,
     highest: float,
-) -> Iterable[str]:
+) -> Iterator[str]:
+    """What to say of numbers that do not exist, and of lengths that differ."""
     short, long = min(durations.values()), max(durations.values())
     if long > ALIKE * short:
         yield (
@@ -326,30 +297,32 @@ def _mind(
         )
     elif math.isnan(together[VARIATION].value):
         yield "the mean is near zero: there is no coefficient of variation"
-    left_out = [
+    left_out = ", ".join(
         range_words(*edges)
         for name, edges in RANGES.items()
         if f"power{name}" in together and math.isnan(together[f"power{name}"].value)
-    ]
+    )
     if left_out:
         yield (
-            f"nothing above {highest:g} Hz was recorded: the power from {', '.join(left_out)} is"
+            f"nothing above {highest:g} Hz was recorded: the power from {left_out} is"
             " left out. Entropies and DFA exponent are of what is slower, so compare them with"
             " recordings of the same rate only"
         )
     if math.isnan(together["tremor_p"].value):
         yield "a tremor was not looked for: its band is not in what was recorded"
-    likelier = (
-        {name: likelier_error([m[f"power{name}"] for m in own]) for name in RANGES}
-        if len(own) >= ENOUGH
-        else {}
-    )
-    if told := [
+
+
+def _notice_agreement(own: list[dict[str, Measure]]) -> Iterator[str]:
+    """What to say where trials agree by chance, so that the error from their scatter is too
+    small."""
+    errors = {name: likelier_error([m[f"power{name}"] for m in own]) for name in RANGES}
+    likelier = ", ".join(
         f"± {error:.2g} from {range_words(*RANGES[name])}"
-        for name, error in likelier.items()
+        for name, error in errors.items()
         if error is not None
-    ]:
+    )
+    if likelier:
         yield (
             "in some bands the trials happen to agree much better than recordings of this length"
-            f" do: {', '.join(told)} is a more likely error of the power than the one in the table"
+            f" do: {likelier} is a more likely error of the power than the one in the table"
         )

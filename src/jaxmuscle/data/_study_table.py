@@ -1,10 +1,11 @@
 """The table of a study: which file is which trial of whom, in which group and condition, and how
 files are read."""
 
+import contextlib
 import math
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -38,14 +39,18 @@ READING = (*FILES, *SPECTRA, "window")
 OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction")
 
 
-Above0 = Annotated[float, Meta(gt=0)]
+# what a key may hold where it may also be missing
+Text = str | None
+Name = str | int | None
+Above0 = Annotated[float, Meta(gt=0)] | None
+NotBelow0 = Annotated[float, Meta(ge=0)] | None
 
 
 class ReadingTable(Table, kw_only=True):
     """How a recording is read."""
 
     column: Annotated[
-        str | int | None,
+        Name,
         says(
             "Column of the force: its name, or its number from 0. Or NAME of a"
             " [point](../recordings.md#what-is-read), if its coordinates are the columns NAME_x,"
@@ -57,37 +62,35 @@ class ReadingTable(Table, kw_only=True):
         ),
     ] = None
     rate: Annotated[
-        Above0 | None,
+        Above0,
         says("Sampling rate [Hz]", missing="as the file says; an error if it does not"),
     ] = None
     units: Annotated[
-        str | None,
+        Text,
         says(
             "Unit of the column",
             missing="as file or name say; of a point an error",
         ),
     ] = None
     axis: Annotated[
-        str | None,
+        Text,
         says(
             "Of a point: x, y, z, or principal, along which it moves most",
             missing="the column is not a point",
         ),
     ] = None
     reference: Annotated[
-        str | int | None,
+        Name,
         says("Column or point that is subtracted from it", missing="nothing is subtracted"),
     ] = None
     time: Annotated[
-        str | int | None,
+        Name,
         says(
             "Column of the time; none leaves the times out",
             missing="found by its name or unit; or a first column that rises evenly",
         ),
     ] = None
-    max_gap: Annotated[
-        Annotated[float, Meta(ge=0)] | None, says("Longest gap that is closed [s]", missing="0.2")
-    ] = None
+    max_gap: Annotated[NotBelow0, says("Longest gap that is closed [s]", missing="0.2")] = None
     outliers: Annotated[
         Literal["keep", "mask"] | None,
         says(
@@ -96,14 +99,14 @@ class ReadingTable(Table, kw_only=True):
         ),
     ] = None
     lever_arm: Annotated[
-        Above0 | None,
+        Above0,
         says(
             "From the axis to where the force acts [m]: turns a torque into N",
             missing="a torque stays a torque",
         ),
     ] = None
     quantity: Annotated[
-        str | None,
+        Text,
         says("What was measured", missing="follows from the unit, else from the column's name"),
     ] = None
     baseline: Annotated[
@@ -121,21 +124,21 @@ class ReadingTable(Table, kw_only=True):
         Annotated[int, Meta(ge=0)] | None, says("Lines to leave out at the top", missing="0")
     ] = None
     sheet: Annotated[
-        str | int | None,
+        Name,
         says(
             "Sheet of a workbook: its name, or its number from 0",
             missing="the only one with a signal; else an error",
         ),
     ] = None
     spectrum: Annotated[
-        str | None,
+        Text,
         says(
             "standard, slow (resolves what is below 1 Hz), multitaper or pwelch; the same for all",
             missing="standard",
         ),
     ] = None
     mvc: Annotated[
-        Above0 | None,
+        Above0,
         says(
             "Maximal voluntary contraction, in the recording's unit",
             missing="level unknown, if the unit is not % MVC",
@@ -155,15 +158,15 @@ class RecordingTable(ReadingTable, kw_only=True):
     ]
     person: Annotated[str | int, says("Name of the person")]
     group: Annotated[
-        str | int | None,
+        Name,
         says("Group of the person; all recordings have one, or none", missing="no groups"),
     ] = None
     condition: Annotated[
-        str | int | None,
+        Name,
         says("Condition of the recording; all have one, or none", missing="no conditions"),
     ] = None
     trial: Annotated[
-        str | int | None,
+        Name,
         says(
             "Which of several trials in a condition",
             missing="no name; a person may have several trials without one",
@@ -179,7 +182,7 @@ class StudyFile(ReadingTable, kw_only=True):
     """What else a study.toml may say."""
 
     table: Annotated[
-        str | None,
+        Text,
         says(
             "Path of a study.csv, from the folder of the study.toml", missing="needs `recordings`"
         ),
@@ -195,14 +198,14 @@ class StudyFile(ReadingTable, kw_only=True):
         ),
     ] = None
     rung: Annotated[
-        int | str | None,
+        Name,
         says(
             "Model of all people: 0 to 3, or auto",
             missing="3 where everybody has five trials in every condition, else 2",
         ),
     ] = None
     noise: Annotated[
-        str | None,
+        Text,
         says(
             "Colour of the noise: white, band-limited, ornstein-uhlenbeck or pink",
             missing="band-limited",
@@ -219,7 +222,7 @@ class StudyFile(ReadingTable, kw_only=True):
         None
     )
     correction: Annotated[
-        str | None, says("Correction for many comparisons: holm, fdr or none", missing="holm")
+        Text, says("Correction for many comparisons: holm, fdr or none", missing="holm")
     ] = None
 
 
@@ -329,109 +332,95 @@ def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cel
     """
     together: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
     stated: dict[Any, tuple[Row, Any]] = {}
+
+    def as_before(row: Row, key: Any, name: str, value: Any, remedy: str) -> None:
+        """Remember what the first row says; refuse a row that says something else."""
+        first, before = stated.setdefault(key, (row, value))
+        if before != value:
+            raise ValueError(f"{name} = {value!r} here, {before!r} at {first.place}: {remedy}")
+
     for row in rows:
         reading = {**defaults, **row.reading}
         window, spectrum, mvc = (reading.pop(name, None) for name in ("window", *SPECTRA))
         whose = row.person, row.group, row.condition
-        try:
+        with _named(row.place):
             require(spectrum in (None, *NAMED), "spectrum", spectrum, choices(str(spectrum), NAMED))
-            require(
-                mvc is None or isinstance(mvc, int | float),
-                "mvc",
-                mvc,
-                "give a number in the unit of the recording",
-            )
-            _as_before(
-                stated,
-                "spectrum",
-                row,
-                spectrum or "standard",
-                "give all rows the same, to compare like with like",
-            )
-            _as_before(
-                stated,
-                whose,
-                row,
-                mvc,
-                "give all trials of a person in a condition the same mvc, or none",
-            )
+            remedy = "give a number in the unit of the recording"
+            require(mvc is None or isinstance(mvc, int | float), "mvc", mvc, remedy)
+            remedy = "give all rows the same, to compare like with like"
+            as_before(row, "spectrum", "spectrum", spectrum or "standard", remedy)
+            remedy = "give all trials of a person in a condition the same mvc, or none"
+            as_before(row, whose, "mvc", mvc, remedy)
             recording = load_recording(row.file, **reading)
             remedy = "give all in one unit, with the column units or by converting the files"
-            _as_before(stated, "unit", row, recording.unit, remedy)
+            as_before(row, "unit", "unit", recording.unit, remedy)
             together[whose].append(recording.steady(window))
-        except ValueError as error:
-            raise ValueError(f"{row.place}: {error}") from None
     found = []
-    for (person, group, condition), recordings in together.items():
+    for whose, recordings in together.items():
+        person, _, condition = whose
         name = ", ".join(filter(None, (person, condition)))
-        first, mvc = stated[person, group, condition]
-        try:
+        first, mvc = stated[whose]
+        with _named(f"{first.place}: {name}"):
             target = Trials(recordings).target(name, mvc=mvc, settings=stated["spectrum"][1])
-        except ValueError as error:
-            raise ValueError(f"{first.place}: {name}: {error}") from None
-        found.append(
-            Cell(
-                person, group, condition, len(recordings), tuple(r.rate for r in recordings), target
-            )
-        )
+        rates = tuple(recording.rate for recording in recordings)
+        found.append(Cell(*whose, len(recordings), rates, target))
     return found
 
 
-def _as_before(
-    stated: dict[Any, tuple[Row, Any]], key: Any, row: Row, value: Any, remedy: str
-) -> None:
-    """Remember what the first row says; refuse a row that says something else."""
-    first, before = stated.setdefault(key, (row, value))
-    if before != value:
-        name = key if isinstance(key, str) else "mvc"
-        raise ValueError(f"{name} = {value!r} here, {before!r} at {first.place}: {remedy}")
+@contextlib.contextmanager
+def _named(place: str) -> Iterator[None]:
+    """An error begins with the place."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from None
 
 
 def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
     """Place and cells of every row of a text table; empty cells left out."""
     lines = [line for line in lines_of(read_text(path, instead=TABLES)) if line.body.strip()]
     delimiter = next((sign for sign in SIGNS if lines and sign in lines[0].body), ",")
-    head, *body = lines
-    names = [name.casefold() for name in cells_of(head.body, delimiter)]
+    (head, *body), found = lines, []
+    names, place = [n.casefold() for n in cells_of(head.body, delimiter)], f"{path}: {head.place}"
     for name in names:
-        if name not in COLUMNS:
-            raise ValueError(
-                f"{path}: {head.place}: unknown column {name!r}; {choices(name, COLUMNS)}"
-            )
+        _check_column(name, place)
         if names.count(name) > 1:
-            raise ValueError(f"{path}: {head.place}: two columns are called {name}: leave one out")
+            raise ValueError(f"{place}: two columns are called {name}: leave one out")
     for name in NEEDED:
         if name not in names:
             raise ValueError(
-                f"{path}: {head.place}: no column {name}; the header needs file and person, and may"
+                f"{place}: no column {name}; the header needs file and person, and may"
                 f" have {', '.join(COLUMNS[2:])}"
             )
-    found = []
     for line in body:
         cells, place = cells_of(line.body, delimiter), f"{path}: {line.place}"
         if len(cells) != len(names):
             raise ValueError(f"{place}: has {len(cells)} cells, the header {len(names)} columns")
-        row: dict[str, Any] = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
-        for name in set(NUMBERS) & set(row):
-            row[name] = _number(name, row[name], delimiter, place)
-        if "detrend" in row:
-            answer = row["detrend"].casefold()
-            require(answer in ANSWERS, f"{place}: detrend", row["detrend"], "write true or false")
-            row["detrend"] = ANSWERS[answer]
-        found.append((place, row))
+        named = [(name, cell) for name, cell in zip(names, cells, strict=True) if cell]
+        found.append((place, {name: _value(name, cell, delimiter, place) for name, cell in named}))
     return found
 
 
-def _number(name: str, cell: str, delimiter: str, place: str) -> int | float:
-    """The number in a cell of the column `name`."""
+def _check_column(name: str, place: str) -> None:
+    if name not in COLUMNS:
+        raise ValueError(f"{place}: unknown column {name!r}; {choices(name, COLUMNS)}")
+
+
+def _value(name: str, cell: str, delimiter: str, place: str) -> Any:
+    """What a cell of the column `name` says."""
+    if name == "detrend":
+        answer = ANSWERS.get(cell.casefold())
+        require(answer is not None, f"{place}: detrend", cell, "write true or false")
+        return answer
+    if name not in NUMBERS:
+        return cell
     whole = name == "skip_rows"
     try:
         number = int(cell) if whole else number_in(cell, delimiter)
     except ValueError:
         number = math.nan
     if not is_real(number):
-        kind = "whole number" if whole else "number"
-        raise ValueError(f"{place}: {name} = {cell!r} is not a {kind}")
+        raise ValueError(f"{place}: {name} = {cell!r} is not a {'whole ' * whole}number")
     return number
 
 
@@ -440,32 +429,32 @@ def _checked(
 ) -> tuple[Row, ...]:
     """The rows, and that together they are a study."""
     rows = tuple(_row(place, given, folder) for place, given in places)
-    group: dict[str, Row] = {}
-    seen: dict[Any, Row] = {}
+    known: dict[Any, Row] = {}
     for row in rows:
         for label in ("group", "condition"):
             if not getattr(row, label) and any(getattr(other, label) for other in rows):
                 raise ValueError(
                     f"{row.place}: has no {label}, others do; give every recording one, or none"
                 )
-        first = group.setdefault(row.person, row)
+        first = known.setdefault(row.person, row)
         if first.group != row.group:
             raise ValueError(
                 f"{row.place}: {row.person} is in group {row.group} here and in group {first.group}"
                 f" at {first.place}; a person has one group (what changes within people: a"
                 " condition)"
             )
-        same = seen.setdefault((row.file, repr(row.reading)), row)
+        same = known.setdefault((row.file, repr(row.reading)), row)
         if same is not row:
             raise ValueError(f"{row.place}: the same recording as at {same.place}: leave one out")
-        twin = seen.setdefault((row.person, row.condition, row.trial), row) if row.trial else row
+        twin = known.setdefault((row.person, row.condition, row.trial), row) if row.trial else row
         if twin is not row:
             raise ValueError(
                 f"{row.place}: trial {row.trial} of {row.person} is there already, at {twin.place}"
             )
-    if len(group) < 2:
+    people = len({row.person for row in rows})
+    if people < 2:
         raise ValueError(
-            f"{source}: holds {len(group)} people; a study needs at least 2 (of one: jaxmuscle fit"
+            f"{source}: holds {people} people; a study needs at least 2 (of one: jaxmuscle fit"
             " TRIALS)"
         )
     return rows
@@ -473,20 +462,20 @@ def _checked(
 
 def _row(place: str, given: dict[str, Any], folder: Path) -> Row:
     for name in given:
-        if name not in COLUMNS:
-            raise ValueError(f"{place}: unknown column {name!r}; {choices(name, COLUMNS)}")
+        _check_column(name, place)
+    filled = {name: value for name, value in given.items() if value is not None}
+    texts = {name: str(filled.get(name, "")).strip() for name in LABELS}
     for name in NEEDED:
-        if not str(given.get(name) or "").strip():
+        if not texts[name]:
             raise ValueError(f"{place}: no {name}; every recording needs a file and a person")
-    window = [given.get(name) for name in EDGES]
+    window = tuple(given.get(name) for name in EDGES)
     if window.count(None) == 1:
         raise ValueError(f"{place}: give window_start and window_stop, or neither")
     file = folder / expanded(str(given["file"]))
-    try:
+    with _named(place):
         looked_at(file, instead="a recording")
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from None
-    reading = {name: given[name] for name in (*FILES, *SPECTRA) if given.get(name) is not None}
-    reading |= {"window": tuple(window)} if None not in window else {}
-    person, group, condition, trial = (str(given.get(name, "")).strip() for name in LABELS[1:])
+    reading = {name: filled[name] for name in (*FILES, *SPECTRA) if name in filled}
+    if None not in window:
+        reading["window"] = window
+    _, person, group, condition, trial = texts.values()
     return Row(place, file, person, group, condition, trial, reading)

@@ -24,8 +24,8 @@ from ._frequency_response import FrequencyResponse
 from ._measure import Measure
 from ._measured import measure_spectrum, widen_errors
 from ._target_data import TargetData
-from ._target_fields import Provenance, Quantity, numbers_of
-from ._target_files import KEYS, REQUIRED, fields_of, on_grid, read_target, settings_of
+from ._target_fields import Provenance, Quantity
+from ._target_files import on_grid, read_target
 
 # A sum this near to 1 is rounding of the printed numbers, not another scale.
 SUM_TOLERANCE = 1e-3
@@ -137,50 +137,59 @@ class Target(Shown, eqx.Module):
         notices: Iterable[str] = (),
     ):
         settings = SpectrumSettings() if settings is None else settings
-        self.name, self.source = check.metadata("name", name), check.metadata("source", source)
-        self.quantity = check.metadata("quantity", quantity)
-        self.provenance = check.metadata("provenance", provenance)
-        self.segments = check.metadata("segments", segments)
-        self.coefficient_of_variation = check.metadata(
-            "coefficient_of_variation", coefficient_of_variation
-        )
+        stated = {
+            "name": name,
+            "quantity": quantity,
+            "provenance": provenance,
+            "source": source,
+            "segments": segments,
+            "coefficient_of_variation": coefficient_of_variation,
+            "mvc_fraction": mvc_fraction,
+            "mean": mean,
+            "unit": unit,
+            "recorded_at": recorded_at,
+            "reason": reason,
+            "dispersion": dispersion,
+        }
+        for field, value in stated.items():
+            setattr(self, field, check.metadata(field, value))
         if self.quantity == "acceleration" and coefficient_of_variation is not None:
             raise TargetError(
                 "coefficient_of_variation: the mean of an acceleration is zero; leave it out"
             )
-        self.mvc_fraction = check.metadata("mvc_fraction", mvc_fraction)
-        self.mean, self.unit = check.metadata("mean", mean), check.metadata("unit", unit)
-        self.reason = check.metadata("reason", reason)
-        self.recorded_at = check.metadata("recorded_at", recorded_at)
         self.measures = check.metadata("measured", measured)
         self.settings, self.samples = settings, Samples(tuple(signals))
-        self.stiffness = (
-            FrequencyResponse.from_table(stiffness) if isinstance(stiffness, Mapping) else stiffness
-        )
-        if self.stiffness is not None and not isinstance(self.stiffness, FrequencyResponse):
+        if isinstance(stiffness, Mapping):
+            stiffness = FrequencyResponse.from_table(stiffness)
+        if not isinstance(stiffness, FrequencyResponse | None):
             raise TargetError(
                 f"stiffness: this is a {type(stiffness).__name__}; give a FrequencyResponse, or its"
                 " table"
             )
+        self.stiffness = stiffness
         if proportional_power is None and stiffness is not None:
             proportional_power, bins = np.zeros(0), np.zeros(0, int)
-        selected = np.arange(settings.first_bin, settings.last_bin + 1)
-        self.bins = check.frozen(selected if bins is None else check.bin_numbers(bins, settings))
+        if bins is None:
+            bins = np.arange(settings.first_bin, settings.last_bin + 1)
+        self.bins = check.frozen(check.bin_numbers(bins, settings))
+        size = self.bins.size
         self.frequency = check.frozen(settings.frequency[self.bins - settings.first_bin])
-        power = (
-            np.zeros(0)
-            if self.bins.size == 0
-            else check.positive("proportional_power", proportional_power, self.bins.size)
-        )
-        deviation = None if sigma is None else check.positive("sigma", sigma, self.bins.size)
-        self.proportional_power, self.sigma = _normalised(power, deviation)
-        self.trial_power, self.dispersion = None, check.metadata("dispersion", dispersion)
+        power, deviation = np.zeros(0), None
+        if size:
+            power = check.bin_powers("proportional_power", proportional_power, size)
+            deviation = None if sigma is None else check.bin_powers("sigma", sigma, size)
+        # the sum of a saved target is 1 to rounding: it is read back exactly
+        total = float(np.sum(power))
+        over = 1.0 if abs(total - 1) < 1e-12 or not size else total
+        self.proportional_power = check.frozen(power / over)
+        self.sigma = None if deviation is None else check.frozen(deviation / over)
+        self.trial_power = None
         if trial_power is not None:
-            self.trial_power = check.trial_powers(trial_power, self.bins.size, self.segments, power)
+            self.trial_power = check.trial_powers(trial_power, self.segments, power)
             self.dispersion = dispersion_of(
                 self.trial_power, self.segments or (), settings, self.bins
             )
-        own = _own_notices(self, float(np.sum(power)))
+        own = _own_notices(self, total)
         self.notices = tuple(dict.fromkeys((*check.metadata("notices", list(notices)), *own)))
 
     @property
@@ -289,36 +298,28 @@ class Target(Shown, eqx.Module):
     def to_table(self, *, whole: bool = False) -> dict[str, Any]:
         """The target as the table that a TOML file holds; `whole`, with None for what it does not
         state, as in fit.json."""
-        sigma = None if self.sigma is None else self.sigma.tolist()
-        arrays = {
-            "frequency_hz": self.frequency.tolist(),
+        said = {
+            "frequency_hz": self.frequency,
+            "dispersion": self.dispersion if self.trial_power is None else None,
+            "measured": None if self.measures is None else check.measured_table(self.measures),
+            "stiffness": None if self.stiffness is None else self.stiffness.to_table(),
             "settings": self.settings.to_dict(whole=whole),
         }
-        arrays |= {"proportional_power": self.proportional_power.tolist(), "sigma": sigma}
-        arrays["trial_power"] = None if self.trial_power is None else self.trial_power.tolist()
-        arrays["dispersion"] = self.dispersion if self.trial_power is None else None
-        arrays["measured"] = None if self.measures is None else check.measured_table(self.measures)
-        arrays["stiffness"] = None if self.stiffness is None else self.stiffness.to_table()
-        table = {key: arrays[key] if key in arrays else getattr(self, key) for key in KEYS}
-        return (
-            table
-            if whole
-            else {key: value for key, value in table.items() if value not in (None, ())}
-        )
+        values = ((key, said[key] if key in said else getattr(self, key)) for key in check.FIELDS)
+        table = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values}
+        return table if whole else {k: v for k, v in table.items() if v not in (None, ())}
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], *, whole: bool = False) -> "Target":
         """The reverse of `to_table`: each frequency counts as the nearest bin. Raises
         `TargetError`."""
-        needed = KEYS if whole else (*REQUIRED, "settings")
-        fields = fields_of(table, "target_table", needed=[k for k in needed if k != "recorded_at"])
+        file = "target_table"
+        fields = check.fields_of(table, file, whole=whole)
         fields = {key: value for key, value in fields.items() if value is not None}
-        settings = settings_of(
-            fields.pop("settings"), "target_table.settings", SpectrumSettings.names(whole=whole)
-        )
-        frequency = numbers_of(
-            "frequency_hz", fields.pop("frequency_hz"), "target_table", empty="stiffness" in fields
-        )
+        names = SpectrumSettings.names(whole=True) if whole else ()
+        settings = check.settings_of(fields.pop("settings", {}), f"{file}.settings", names)
+        key = "frequency_hz"
+        frequency = check.numbers_of(key, fields.pop(key), file, empty="stiffness" in fields)
         with np.errstate(over="ignore"):
             bins = np.rint(np.clip(frequency / settings.resolution, -1e9, 1e9)).astype(int)
         return cls(**fields, bins=bins, settings=settings)
@@ -394,11 +395,11 @@ def load_target(
         print(target)
 
     A CSV has the columns `frequency_hz,proportional_power[,sigma]`, sorted and unique. A figure
-    digitised with WebPlotDigitizer is its project (.json, .tar), its CSV of all datasets, or two
-    columns without a header; its points are sorted and near-duplicates averaged (docs/digitise.md).
-    Points off the grid are interpolated onto the bins in log power, and in log frequency from a
-    logarithmic axis; bins that are not covered are left out, and power is rescaled to sum to 1 over
-    the others. The target's `notices` say which of these happened.
+    digitised with WebPlotDigitizer is its CSV of all datasets, or two columns without a header; its
+    points are sorted and near-duplicates averaged (docs/digitise.md). Points off the grid are
+    interpolated onto the bins in log power, and in log frequency from a logarithmic axis; bins that
+    are not covered are left out, and power is rescaled to sum to 1 over the others. The target's
+    `notices` say which of these happened.
 
     **Arguments:**
 
@@ -435,18 +436,6 @@ def _dispersion_in_words(dispersion: Sequence[float]) -> str:
 
 def _words(value: str | tuple[int, ...]) -> str:
     return value if isinstance(value, str) else " + ".join(map(str, value))
-
-
-def _normalised(
-    power: np.ndarray, sigma: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Both over the sum of the power, unless that is 1 to rounding: a saved target is read back
-    exactly."""
-    if not power.size:
-        return check.frozen(power), None
-    total = np.sum(power)
-    total = 1.0 if abs(total - 1) < 1e-12 else total
-    return check.frozen(power / total), None if sigma is None else check.frozen(sigma / total)
 
 
 def _own_notices(target: Target, total: float) -> list[str]:

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, overload
+from typing import Any, Unpack, overload
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum
 
 from ._recording import Recording, notices_of, pooled_target, recorded_settings
+from ._recording_choice import ReadingOptions
 from ._recording_files import load_columns, load_recording, read_tables
-from ._recording_quality import Baseline
 from ._recording_table import Table
 from ._target import Target
 
@@ -39,13 +39,9 @@ class Trials(Shown, Sequence[Recording]):
     def __init__(self, recordings: Iterable[Recording]):
         self.recordings = tuple(recordings)
         require(len(self.recordings) > 0, "recordings", [], "give at least one")
+        remedy = "give Recordings; load_recording(...) reads a file"
         for other in self.recordings:
-            require(
-                isinstance(other, Recording),
-                "recordings",
-                other,
-                "give Recordings, as load_recording returns them",
-            )
+            require(isinstance(other, Recording), "recordings", other, remedy)
         units = dict.fromkeys(recording.unit for recording in self.recordings)
         if len(units) > 1:
             raise ValueError(
@@ -123,13 +119,8 @@ class Trials(Shown, Sequence[Recording]):
     def _notices(self, settings: SpectrumSettings | str | None = None) -> tuple[str, ...]:
         """What to mind of the recordings and their windows."""
         chosen, quantity = recorded_settings(settings), self.recordings[0].quantity
-        return notices_of(
-            self.recordings,
-            [r.filtered(chosen) for r in self],
-            chosen.rate,
-            [()] * len(self),
-            quantity,
-        )
+        signals = [recording.filtered(chosen) for recording in self]
+        return notices_of(self.recordings, signals, chosen.rate, quantity)
 
     def plot(self, settings: SpectrumSettings | str | None = None, ax: Any = None) -> Any:
         """Draw the windows and the spectra of the recordings; a single one as by `Recording.plot`.
@@ -146,24 +137,13 @@ class Trials(Shown, Sequence[Recording]):
         return Card(folded([head, *lines]), head, ("recording", "window", "mean"), rows)
 
 
-def load_recordings(  # noqa: PLR0913 (options of a public call)
+def load_recordings(
     paths: "Iterable[str | os.PathLike[str] | Table] | str | os.PathLike[str] | Table",
     *,
     columns: Iterable[str | int] | None = None,
-    column: str | int | None = None,
-    rate: float | int | None = None,
-    units: str | None = None,
-    axis: str | None = None,
-    reference: str | int | None = None,
-    time: str | int | None = None,
     skip_rows: int = 0,
     sheet: str | int | None = None,
-    max_gap: float | int = 0.2,
-    outliers: str = "keep",
-    lever_arm: float | int | None = None,
-    quantity: str | None = None,
-    baseline: Baseline = None,
-    detrend: bool = False,
+    **options: Unpack[ReadingOptions],
 ) -> Trials:
     """Load the trials of one person in one condition.
 
@@ -175,33 +155,18 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
       `jaxmuscle.data.read_table` read of them)
     - `columns`: which columns of this one file are trials (by default all with numbers but the
       time)
-    - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `sheet`, `max_gap`,
-      `outliers`, `lever_arm`, `quantity`, `baseline`, `detrend`: as in `load_recording`, the same
-      for all files. Several sheets of one layout in a workbook are trials, unless `sheet` names one
+    - `skip_rows`, `sheet`, and the `options` for one column (`column`, `rate`, `units`, `axis`,
+      `reference`, `time`, `max_gap`, `outliers`, `lever_arm`, `quantity`, `baseline`, `detrend`):
+      as in `load_recording`, the same for all files. Several sheets of one layout in a workbook are
+      trials, unless `sheet` names one
 
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does,
     and for different units.
     """
-    options: dict[str, Any] = {
-        "rate": rate,
-        "units": units,
-        "axis": axis,
-        "reference": reference,
-        "time": time,
-        "max_gap": max_gap,
-        "outliers": outliers,
-        "lever_arm": lever_arm,
-        "quantity": quantity,
-        "baseline": baseline,
-        "detrend": detrend,
-    }
     if isinstance(paths, str | os.PathLike | Table):
-        require(
-            column is None,
-            "column",
-            column,
-            "one file holds all trials here; name several with `columns`",
-        )
+        column = options.pop("column", None)
+        remedy = "one file holds all trials here; name several with `columns`"
+        require(column is None, "column", column, remedy)
         return Trials(load_columns(paths, columns, skip_rows=skip_rows, sheet=sheet, **options))
     files = list(paths)
     if columns is not None:
@@ -209,4 +174,4 @@ def load_recordings(  # noqa: PLR0913 (options of a public call)
             "columns: these are for one file that holds all trials; give its path alone, as a text"
         )
     tables = [table for path in files for table in read_tables(path, skip_rows, sheet)]
-    return Trials(load_recording(table, column=column, **options) for table in tables)
+    return Trials(load_recording(table, **options) for table in tables)

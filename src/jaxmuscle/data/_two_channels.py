@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxmuscle._common.arguments import require
 
-from ._as_target import is_recording
+from ._as_target import are_recordings
 from ._perturbed import PerturbedRecording
 from ._recording_choice import (
     FORCE,
@@ -110,9 +110,7 @@ def perturbed_recordings(
     several = given if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
     if len(several) > 0 and all(isinstance(one, PerturbedRecording) for one in several):
         return tuple(several)
-    if not files or not all(
-        isinstance(one, str | os.PathLike) and is_recording(one) for one in several
-    ):
+    if not files or not are_recordings(several):
         return ()
     tables = [table for one in several for table in read_tables(one)]
     channels = [_found_in(table, None, None, None) for table in tables]

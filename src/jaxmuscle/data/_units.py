@@ -6,47 +6,45 @@ import re
 import unicodedata
 from typing import Any
 
-import numpy as np
-
-from jaxmuscle._common.arguments import require
+from jaxmuscle._common.arguments import is_real, require
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.units import NEWTONS
 
-# Each unit, what it measures (None: anything), and how else it is written, without blanks, in small
-# letters. A load cell weighs in kg, and every unit may also be written in capitals or as it is.
-_TABLE: tuple[tuple[str, str | None, str], ...] = (
-    ("N", "force", "newton newtons"),
-    ("mN", "force", "millinewton millinewtons"),
-    ("kN", "force", "kilonewton kilonewtons"),
-    ("kgf", "force", "kg kp kgs kilogram kilograms kilopond kgforce kilogramforce"),
-    ("gf", "force", "gramforce gramsforce pond"),
-    ("lbf", "force", "lb lbs lbsf pound pounds poundforce poundsforce"),
-    ("% MVC", "force", "%mvc mvc% %ofmvc pctmvc percentmvc percentofmvc %mvf %mvic %mvt %"),
-    ("N m", "torque", "newtonmeter newtonmeters newtonmetre newtonmetres"),
-    ("mN m", "torque", ""),
-    ("N cm", "torque", ""),
-    ("N mm", "torque", ""),
-    ("kgf m", "torque", "kgm kpm"),
-    ("lbf ft", "torque", "ftlb ftlbs ftlbf lbft lbsft footpound footpounds poundfoot poundfeet"),
-    ("lbf in", "torque", "inlb inlbs inlbf lbin lbsin inchpound inchpounds"),
-    ("m", "displacement", "meter meters metre metres"),
-    ("cm", "displacement", "centimeter centimeters centimetre centimetres"),
-    ("mm", "displacement", "millimeter millimeters millimetre millimetres"),
-    ("um", "displacement", "micrometer micrometers micron microns"),
-    ("deg", "angle", "degree degrees ° grad"),
-    ("rad", "angle", "radian radians"),
-    ("m/s^2", "acceleration", "ms2 m/s/s m/sec2 m/s2 ms^2 m/sec/sec mps2"),
-    ("mm/s^2", "acceleration", "mms2 mm/s/s mm/sec2"),
-    ("g", "acceleration", "g's gs gn g0"),
-    ("mg", "acceleration", ""),
-    ("deg/s", "angular velocity", "dps °/s deg/sec degs1 degree/s degrees/s degps"),
-    ("rad/s", "angular velocity", "rads1 rad/sec radian/s radians/s radps"),
-    ("V", None, "volt volts"),
-    ("mV", None, "millivolt millivolts"),
-    ("uV", None, "microvolt microvolts"),
-    ("a.u.", None, "arb arbunits arbitraryunits counts count adc lsb bits"),
-)
-UNITS = {unit: quantity for unit, quantity, _ in _TABLE}
+# Each unit | what it measures (nothing: anything) | how else it is written, without blanks, in
+# small letters. A load cell weighs in kg. Every unit may also be written in capitals or as it is.
+_TABLE = """\
+N | force | newton newtons
+mN | force | millinewton millinewtons
+kN | force | kilonewton kilonewtons
+kgf | force | kg kp kgs kilogram kilograms kilopond kgforce kilogramforce
+gf | force | gramforce gramsforce pond
+lbf | force | lb lbs lbsf pound pounds poundforce poundsforce
+% MVC | force | %mvc mvc% %ofmvc pctmvc percentmvc percentofmvc %mvf %mvic %mvt %
+N m | torque | newtonmeter newtonmeters newtonmetre newtonmetres
+mN m | torque |
+N cm | torque |
+N mm | torque |
+kgf m | torque | kgm kpm
+lbf ft | torque | ftlb ftlbs ftlbf lbft lbsft footpound footpounds poundfoot poundfeet
+lbf in | torque | inlb inlbs inlbf lbin lbsin inchpound inchpounds
+m | displacement | meter meters metre metres
+cm | displacement | centimeter centimeters centimetre centimetres
+mm | displacement | millimeter millimeters millimetre millimetres
+um | displacement | micrometer micrometers micron microns
+deg | angle | degree degrees ° grad
+rad | angle | radian radians
+m/s^2 | acceleration | ms2 m/s/s m/sec2 m/s2 ms^2 m/sec/sec mps2
+mm/s^2 | acceleration | mms2 mm/s/s mm/sec2
+g | acceleration | g's gs gn g0
+mg | acceleration |
+deg/s | angular velocity | dps °/s deg/sec degs1 degree/s degrees/s degps
+rad/s | angular velocity | rads1 rad/sec radian/s radians/s radps
+V |  | volt volts
+mV |  | millivolt millivolts
+uV |  | microvolt microvolts
+a.u. |  | arb arbunits arbitraryunits counts count adc lsb bits"""
+_ROWS = [[cell.strip() for cell in line.split("|")] for line in _TABLE.splitlines()]
+UNITS = {unit: quantity or None for unit, quantity, _ in _ROWS}
 SCALELESS = ("a.u.",)  # whose numbers say something only relative to their mean
 # With a capital M these would be millions.
 _SMALL = ("mN", "mN m")
@@ -107,34 +105,7 @@ _BRACKETS = re.compile(r"\[([^\[\]]+)\]|\(([^()]+)\)")
 # Where a name may end and its unit begin. A unit of several words is tried before its last word.
 _BORDER = re.compile(r"\s*(?:[_/,;:.–—-]|\bin\b|\s)\s*")
 # What a unit is by itself behind _ or /, whatever the name.
-_PLAIN = [
-    "N",
-    "mN",
-    "kN",
-    "kg",
-    "kgf",
-    "gf",
-    "lb",
-    "lbs",
-    "lbf",
-    "pctMVC",
-    "Nm",
-    "Ncm",
-    "Nmm",
-    "m",
-    "cm",
-    "mm",
-    "um",
-    "µm",
-    "V",
-    "mV",
-    "s",
-    "ms",
-    "us",
-    "ns",
-    "deg",
-    "rad",
-]
+_PLAIN = re.compile("[mk]?N|kgf?|gf|lb[sf]?|pctMVC|N[cm]?m|[cmuµ]?m|m?V|[mun]?s|deg|rad")
 
 
 def _squeezed(unit: str, slash: str) -> str:
@@ -145,7 +116,7 @@ def _squeezed(unit: str, slash: str) -> str:
 
 _EXACT = {_squeezed(unit, ""): unit for unit in UNITS}
 _SPELLED = {_squeezed(unit, "").casefold(): unit for unit in UNITS} | {
-    word: unit for unit, _, words in _TABLE for word in words.split()
+    word: unit for unit, _, words in _ROWS for word in words.split()
 }
 
 
@@ -211,7 +182,7 @@ def _is_unit(text: str, head: str, border: str) -> bool:
     """Whether a text behind the name `head` is its unit."""
     if name_and_unit(head)[1] or known_unit(head.split()[-1]):  # Nm/kg is no unit of kg
         return False
-    if border in ("_", "/") and text in _PLAIN:
+    if border in ("_", "/") and _PLAIN.fullmatch(text):
         return True
     named, unit = named_quantity(head), known_unit(text, head)
     if unit is None:
@@ -230,26 +201,23 @@ def scale_to_si(unit: str, argument: str, quantity: str, lever_arm: Any) -> tupl
     **Raises:** `ValueError` that names `argument` for the unit of something else, and for a lever
     arm that is missing.
     """
-    turned = {"force": "torque", "displacement": "angle"}[quantity]
-    known = known_unit(unit)
-    remedy = (
-        f"give the unit of a {quantity} or of its {turned};"
-        f" {choices(unit, (*_SI[quantity], *_SI[turned]))}"
-    )
-    if known in ("V", "mV", "uV"):
+    turned, si = {"force": ("torque", "N"), "displacement": ("angle", "m")}[quantity]
+    known, straight = str(known_unit(unit)), _SI[quantity]
+    if known in straight:
+        return straight[known], False
+    if known not in _SI[turned]:
         remedy = (
             "a sensor gives volts. Multiply by its calibration first"
-            f" ({'N' if quantity == 'force' else 'm'} for each volt), and name the column with the"
-            f" new unit ({'force_N' if quantity == 'force' else 'displacement_m'})"
+            f" ({si} for each volt), and name the column with the new unit ({quantity}_{si})"
+            if known in ("V", "mV", "uV")
+            else f"give the unit of a {quantity} or of its {turned};"
+            f" {choices(unit, (*straight, *_SI[turned]))}"
         )
-    require(known in _SI[quantity] or known in _SI[turned], argument, unit, remedy)
-    if known in _SI[quantity]:
-        return _SI[quantity][str(known)], False
+        raise ValueError(f"{argument}={unit!r}: {remedy}")
     remedy = (
         f"`{argument}` is {known}: give the distance from the axis to the insertion in m, as"
         " lever_arm=0.1; or, if nothing moved the insertion, the force alone, as `column`"
     )
-    number = isinstance(lever_arm, int | float | np.number) and not isinstance(lever_arm, bool)
-    require(number and 0 < lever_arm < math.inf, "lever_arm", lever_arm, remedy)
-    scale, arm = _SI[turned][str(known)], float(lever_arm)
+    require(is_real(lever_arm) and lever_arm > 0, "lever_arm", lever_arm, remedy)
+    scale, arm = _SI[turned][known], float(lever_arm)
     return (scale / arm if quantity == "force" else scale * arm), True
