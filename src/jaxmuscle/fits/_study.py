@@ -10,7 +10,7 @@ import tempfile
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
 import equinox as eqx
 import numpy as np
@@ -27,6 +27,7 @@ from jaxmuscle._common.tables import csv_of, frame
 from jaxmuscle._common.text import WIDTH, choices
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._measured import MEASURES
+from jaxmuscle.data._recording_choice import ReadingOptions
 from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_study
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
@@ -412,7 +413,7 @@ def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
     }
 
 
-class StudyOptions(TypedDict, total=False):
+class StudyOptions(ReadingOptions, total=False):
     """What a study's table may also say: the model and the statistics, and how files are read where
     a row does not say it (None: as if left out)."""
 
@@ -422,20 +423,8 @@ class StudyOptions(TypedDict, total=False):
     alpha: float | None
     correction: str | None
     window: Sequence[float | int] | str | None
-    column: str | int | None
-    rate: float | int | None
-    units: str | None
-    axis: str | None
-    reference: str | int | None
-    time: str | int | None
     skip_rows: int | None
     sheet: str | int | None
-    max_gap: float | int | None
-    outliers: str | None
-    lever_arm: float | int | None
-    quantity: str | None
-    baseline: str | Sequence[float | int] | None
-    detrend: bool | None
     spectrum: str | None
     mvc: float | int | None
 
