@@ -303,7 +303,7 @@ class Target(Shown, eqx.Module):
             "dispersion": self.dispersion if self.trial_power is None else None,
             "measured": None if self.measures is None else check.measured_table(self.measures),
             "stiffness": None if self.stiffness is None else self.stiffness.to_table(),
-            "settings": self.settings.to_dict(whole=whole),
+            "settings": self.settings.to_dict(),
         }
         values = ((key, said[key] if key in said else getattr(self, key)) for key in check.FIELDS)
         table = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values}
@@ -316,8 +316,8 @@ class Target(Shown, eqx.Module):
         file = "target_table"
         fields = check.fields_of(table, file, whole=whole)
         fields = {key: value for key, value in fields.items() if value is not None}
-        names = SpectrumSettings.names(whole=True) if whole else ()
-        settings = check.settings_of(fields.pop("settings", {}), f"{file}.settings", names)
+        stated = fields.pop("settings", {})
+        settings = check.settings_of(stated, f"{file}.settings", whole=whole)
         key = "frequency_hz"
         frequency = check.numbers_of(key, fields.pop(key), file, empty="stiffness" in fields)
         with np.errstate(over="ignore"):

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float
 
 from jaxmuscle.data._recording import RECORDED, Recording
@@ -19,7 +20,7 @@ from jaxmuscle.model._white_noise import OrnsteinUhlenbeckNoise
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._presets import load_preset
 from jaxmuscle.simulation._trajectory import Trajectory, stack
-from jaxmuscle.spectra._measures import approximate_entropy, peaks, spearman
+from jaxmuscle.spectra._measures import approximate_entropy, peaks
 from jaxmuscle.spectra._settings import WINDOW
 from jaxmuscle.spectra._welch import Spectrum, lowpass
 
@@ -104,12 +105,16 @@ class Experiment(eqx.Module):
     @property
     def rho_fft(self) -> tuple[float, ...]:
         """Spearman correlation of the FFT power of each pair."""
-        return tuple(spearman(self.fft[i].power, self.fft[j].power) for i, j in self.pairs)
+        return self._rho(self.fft)
 
     @property
     def rho_welch(self) -> tuple[float, ...]:
         """Spearman correlation of the Welch power of each pair."""
-        return tuple(spearman(self.welch[i].power, self.welch[j].power) for i, j in self.pairs)
+        return self._rho(self.welch)
+
+    def _rho(self, spectra: tuple[Spectrum, ...]) -> tuple[float, ...]:
+        powers = ((spectra[i].power, spectra[j].power) for i, j in self.pairs)
+        return tuple(float(scipy.stats.spearmanr(*pair).statistic) for pair in powers)
 
 
 def tuned(task: AbstractTask) -> Tuned:

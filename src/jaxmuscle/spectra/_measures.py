@@ -1,25 +1,20 @@
-"""Numbers that describe a force record and its spectrum: variability, regularity, rank correlation,
-peaks."""
+"""Numbers that describe a force record and its spectrum: variability, regularity, peaks."""
 
-from typing import Any, Literal, get_args
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Bool, Float, Int, Real
 
 from jaxmuscle._common.arguments import require
 from jaxmuscle._common.arrays import all_concrete, as_arrays
 from jaxmuscle._common.programs import kept
 
 from ._fluctuations import one_record
-from ._neighbours import neighbours
 from ._welch import Spectrum, floating
-
-Reference = Literal["mean", "maximum", "mvc"]
 
 
 def _standard_deviation(signal: Float[Array, "*batch times"]) -> Float[Array, "*batch"]:
@@ -66,29 +61,15 @@ def signal_to_noise(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[A
     return jnp.mean(signal, axis=-1) / _standard_deviation(signal)
 
 
-def _record(
-    signal: Real[Array | np.ndarray, "..."], m: int, tolerance: float
-) -> tuple[np.ndarray, float]:
-    """One checked record, and the radius within which its templates match."""
-    require(m >= 1, "m", m, "give the template length, at least 1")
-    require(
-        0 < tolerance < np.inf, "tolerance", tolerance, "give a positive fraction of the deviation"
-    )
-    x = one_record(signal, m + 2, "m + 2 = ")
-    return x, tolerance * float(np.std(x))
-
-
-def _templates(x: Float[np.ndarray, " times"], m: int) -> Float[np.ndarray, "templates m"]:
-    return np.lib.stride_tricks.sliding_window_view(x, m)
-
-
-def _counts(signal: Any, m: int, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How many templates of m, and of m + 1 samples, match each of their kind, and which of those
-    of m match the last."""
-    x, radius = _record(signal, m, tolerance)
-    shorter, longer = (_templates(x, length) for length in (m, m + 1))
-    last = np.max(np.abs(shorter - shorter[-1]), axis=1) <= radius
-    return neighbours(shorter, radius), neighbours(longer, radius), last
+def _counts(
+    x: Float[np.ndarray, " times"], m: int, radius: float
+) -> tuple[Int[np.ndarray, " templates"], Bool[np.ndarray, " templates"]]:
+    """How many templates of m samples match each of them, and which match the last."""
+    templates = np.lib.stride_tricks.sliding_window_view(x, m)
+    # counted without listing them: memory grows with the number of samples, not its square
+    tree = scipy.spatial.KDTree(templates, leafsize=32)
+    found = tree.query_ball_point(templates, radius, p=np.inf, return_length=True)
+    return np.asarray(found), np.max(np.abs(templates - templates[-1]), axis=1) <= radius
 
 
 def regularity(
@@ -96,8 +77,14 @@ def regularity(
 ) -> tuple[float, float]:
     """`approximate_entropy` and `sample_entropy`, for which the templates are compared only
     once."""
-    shorter, longer, last = _counts(signal, m, tolerance)
+    require(m >= 1, "m", m, "give the template length, at least 1")
+    remedy = "give a positive fraction of the deviation"
+    require(0 < tolerance < np.inf, "tolerance", tolerance, remedy)
+    x = one_record(signal, m + 2, "m + 2 = ")
+    radius = tolerance * float(np.std(x))
+    (shorter, last), (longer, _) = (_counts(x, length, radius) for length in (m, m + 1))
     phi, phi_longer = (float(np.mean(np.log(count / len(count)))) for count in (shorter, longer))
+    # those that begin with the last m samples, which none of m + 1 do, and each with itself
     b, a = int(np.sum(shorter[:-1] - 1) - np.sum(last[:-1])), int(np.sum(longer - 1))
     none = float("nan") if b == 0 else float("inf")
     return phi - phi_longer, none if a == 0 else float(np.log(b / a))
@@ -146,68 +133,6 @@ def sample_entropy(
     **Source:** Richman & Moorman 2000, doi:10.1152/ajpheart.2000.278.6.H2039.
     """
     return regularity(signal, m, tolerance)[1]
-
-
-def spearman(a: Real[Array | np.ndarray, "..."], b: Real[Array | np.ndarray, "..."]) -> float:
-    """Spearman's rank correlation, for instance between the spectra of two people. Not traceable.
-
-        jm.spectra.spearman(np.arange(30.0), np.arange(30.0) ** 2)  # 1.0
-
-    **Arguments:** `a`, `b` (bins,), paired values in any units.
-
-    **Returns:** a number from -1 to 1 (`scipy.stats.spearmanr`).
-
-    **Raises:** `ValueError` for unequal shapes, fewer than 3 values, and constant or non-finite
-    values.
-    """
-    left, right = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    paired = left.shape == right.shape and left.ndim == 1 and left.size >= 3
-    require(
-        paired,
-        "shapes of a, b",
-        (left.shape, right.shape),
-        "give two equally long rows of 3 or more",
-    )
-    for name, values in (("a", left), ("b", right)):
-        ranked = np.all(np.isfinite(values)) and np.ptp(values) > 0
-        require(ranked, name, values, "ranks need finite values that are not all equal")
-    return float(np.asarray(scipy.stats.spearmanr(left, right))[0])
-
-
-def normalised(
-    signal: Real[Array | np.ndarray, "*batch times"],
-    by: Reference = "mean",
-    *,
-    mvc: float | Real[Array | np.ndarray, ""] | None = None,
-) -> Float[Array, "*batch times"]:
-    """The signal over its mean, its largest absolute value, or the maximal voluntary contraction
-    (MVC).
-
-        shares = jm.spectra.normalised(5 + np.sin(np.arange(1000.0)), "maximum")
-
-    **Arguments:**
-
-    - `signal` [unit]: force or displacement, time along the last axis
-    - `by`: one of `"mean"`, `"maximum"`, `"mvc"`
-    - `mvc` [unit]: for `by="mvc"` only
-
-    **Returns:** the signal without unit, same shape and dtype; not finite where the reference is
-    zero.
-
-    **Raises:** `ValueError` for an unknown `by`, and an `mvc` that is missing, not positive, or not
-    needed.
-    """
-    signal = floating(signal)
-    require(by in get_args(Reference), "by", by, f"choose one of {', '.join(get_args(Reference))}")
-    remedy = f"by={by!r}; give mvc together with by='mvc', and only then"
-    require((mvc is not None) == (by == "mvc"), "mvc", mvc, remedy)
-    if by == "mean":
-        return signal / jnp.mean(signal, axis=-1, keepdims=True)
-    if by == "maximum":
-        return signal / jnp.max(jnp.abs(signal), axis=-1, keepdims=True)
-    positive = isinstance(mvc, jax.core.Tracer) or 0 < float(np.asarray(mvc)) < np.inf
-    require(positive, "mvc", mvc, "give the force at maximal voluntary contraction, above zero")
-    return signal / jnp.asarray(mvc, signal.dtype)
 
 
 class Peak(eqx.Module):
