@@ -16,6 +16,8 @@ from jaxmuscle._common.programs import kept
 from ._fluctuations import one_record
 from ._welch import Spectrum, floating
 
+Counts = Int[np.ndarray, " _"]
+
 
 def _standard_deviation(signal: Float[Array, "*batch times"]) -> Float[Array, "*batch"]:
     variance = jnp.var(signal, axis=-1)
@@ -63,13 +65,22 @@ def signal_to_noise(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[A
 
 def _counts(
     x: Float[np.ndarray, " times"], m: int, radius: float
-) -> tuple[Int[np.ndarray, " templates"], Bool[np.ndarray, " templates"]]:
-    """How many templates of m samples match each of them, and which match the last."""
-    templates = np.lib.stride_tricks.sliding_window_view(x, m)
-    # counted without listing them: memory grows with the number of samples, not its square
-    tree = scipy.spatial.KDTree(templates, leafsize=32)
-    found = tree.query_ball_point(templates, radius, p=np.inf, return_length=True)
-    return np.asarray(found), np.max(np.abs(templates - templates[-1]), axis=1) <= radius
+) -> tuple[Counts, Counts, Bool[np.ndarray, " templates"]]:
+    """How many templates of m, and of m + 1 samples, match each of their kind, and which of those
+    of m match the last."""
+    n, order = x.size, np.argsort(x, kind="stable")
+    ranks = np.empty(n, np.int32)
+    ranks[order] = np.arange(n)
+    low = np.searchsorted(x[order], x - radius).astype(np.int32)
+    width = (np.searchsorted(x[order], x + radius, side="right") - low).astype(np.uint32)
+    counts, last = np.zeros((m + 1, n), int), [np.zeros(n - k, bool) for k in range(m + 1)]
+    for i in range(n):
+        # those below the lower bound wrap around to large numbers: one comparison for both bounds
+        near = (ranks - low[i]).view(np.uint32) < width[i]
+        # which templates of k + 1 samples match the one that ends with sample i
+        last = [near, *(last[k - 1][:-1] & near[k:] for k in range(1, m + 1))]
+        counts[:, i] = [np.count_nonzero(match) for match in last]
+    return counts[m - 1, m - 1 :], counts[m, m:], last[m - 1]
 
 
 def regularity(
@@ -81,8 +92,7 @@ def regularity(
     remedy = "give a positive fraction of the deviation"
     require(0 < tolerance < np.inf, "tolerance", tolerance, remedy)
     x = one_record(signal, m + 2, "m + 2 = ")
-    radius = tolerance * float(np.std(x))
-    (shorter, last), (longer, _) = (_counts(x, length, radius) for length in (m, m + 1))
+    shorter, longer, last = _counts(x, m, tolerance * float(np.std(x)))
     phi, phi_longer = (float(np.mean(np.log(count / len(count)))) for count in (shorter, longer))
     # those that begin with the last m samples, which none of m + 1 do, and each with itself
     b, a = int(np.sum(shorter[:-1] - 1) - np.sum(last[:-1])), int(np.sum(longer - 1))
