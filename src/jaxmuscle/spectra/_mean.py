@@ -3,16 +3,14 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.arrays import is_concrete
 from jaxmuscle._common.cards import Card, Shown, facts
 
 from ._settings import SpectrumSettings
-from ._welch import Spectrum
+from ._welch import Spectrum, is_known
 
 Bins = Float[Array | np.ndarray, " bins"]
 
@@ -38,7 +36,7 @@ class SpectrumEstimate(Shown, eqx.Module):
 
     def _card(self) -> Card:
         numbers = (self.power, self.stderr, self.plain_stderr)
-        if not all(isinstance(x, jax.Array | np.ndarray) and is_concrete(x) for x in numbers):
+        if not all(map(is_known, numbers)):
             return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
         power, *errors = (np.asarray(x) for x in numbers)
         error, plain = (100 * float(np.median(each / power)) for each in errors)

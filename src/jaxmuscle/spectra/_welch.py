@@ -32,43 +32,19 @@ class Spectrum(Shown, eqx.Module):
     unit: str = eqx.field(static=True, default="N")
 
     def _card(self) -> Card:
-        known = (
-            isinstance(x, jax.Array | np.ndarray) and is_concrete(x)
-            for x in (self.frequency, self.power)
-        )
-        if not all(known) or self.frequency.shape[-1:] != self.power.shape[-1:]:
+        if not all(map(is_known, (self.frequency, self.power))) or (
+            self.frequency.shape[-1:] != self.power.shape[-1:]
+        ):
             return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
-        frequency, power, apart = (
-            np.asarray(self.bins),
-            np.asarray(self.power, float),
-            self.settings.resolution,
-        )
-        rows = [
-            (
-                "bins",
-                (
-                    f"{frequency.size}, {frequency[0]:.3g} to {frequency[-1]:.3g} Hz, {apart:.3g}"
-                    " Hz apart"
-                ),
-            )
-        ]
+        f, power, apart = np.asarray(self.bins), np.asarray(self.power), self.settings.resolution
+        rows = [("bins", f"{f.size}, {f[0]:.3g} to {f[-1]:.3g} Hz, {apart:.3g} Hz apart")]
         if power.ndim > 1:
             rows.append(("spectra", f"{' x '.join(map(str, power.shape[:-1]))}; below, their mean"))
             power = power.mean(axis=tuple(range(power.ndim - 1)))
-        largest, square = (
-            int(np.argmax(power)),
-            f"({self.unit})^2" if "/" in self.unit else f"{self.unit}^2",
-        )
+        square = f"({self.unit})^2" if "/" in self.unit else f"{self.unit}^2"
+        top, share = f[np.argmax(power)], 100 * power.max() / power.sum()
         rows.append(("variance", f"{power.sum() * apart:.4g} {square} in these bins"))
-        rows.append(
-            (
-                "largest",
-                (
-                    f"bin at {frequency[largest]:.3g} Hz, {100 * power[largest] / power.sum():.3g}"
-                    " % of the power"
-                ),
-            )
-        )
+        rows.append(("largest", f"bin at {top:.3g} Hz, {share:.3g} % of the power"))
         return facts(f"power spectral density [{square}/Hz]", rows)
 
     @property
@@ -98,6 +74,11 @@ class Spectrum(Shown, eqx.Module):
     ) -> Any:
         """Draws power over frequency and returns the axes, see `jaxmuscle.plot.spectrum`."""
         return plot.spectrum(self, ax, log=log, proportional=proportional, label=label)
+
+
+def is_known(x: Any) -> bool:
+    """Whether it is an array with values, and not something that JAX traces or took its place."""
+    return isinstance(x, jax.Array | np.ndarray) and is_concrete(x)
 
 
 def floating(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch times"]:
