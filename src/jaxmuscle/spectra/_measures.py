@@ -201,19 +201,12 @@ def peaks(spectrum: Spectrum, *, min_prominence: float = 0.01) -> Peaks:
             " peaks outside"
         )
     p = np.asarray(spectrum.proportional, dtype=float)
-    one = p.ndim == 1 and p.size >= 3
-    require(
-        one,
-        "spectrum.power shape",
-        p.shape,
-        "give one spectrum of 3 bins or more, as spectrum.mean()",
-    )
-    require(
-        np.all(np.isfinite(p)), "spectrum.power", spectrum.power, "give finite power, not all zero"
-    )
-    require(
-        0 <= min_prominence <= 1, "min_prominence", min_prominence, "give a fraction of the maximum"
-    )
+    remedy = "give one spectrum of 3 bins or more, as spectrum.mean()"
+    require(p.ndim == 1 and p.size >= 3, "spectrum.power shape", p.shape, remedy)
+    finite = np.all(np.isfinite(p))
+    require(finite, "spectrum.power", spectrum.power, "give finite power, not all zero")
+    share = 0 <= min_prominence <= 1
+    require(share, "min_prominence", min_prominence, "give a fraction of the maximum")
     indices, found = scipy.signal.find_peaks(p, prominence=min_prominence * p.max())
     pairs = zip(indices, found["prominences"], strict=True)
     top = int(np.argmax(p))
@@ -272,27 +265,28 @@ def _peak_frequency(
         seen = jnp.where((frequency >= low) & (frequency <= high), p, -jnp.inf)
         k = jnp.argmax(jax.lax.stop_gradient(seen))
         at = jnp.clip(k, 1, len(p) - 2) + jnp.arange(-1, 2)
-        f, three = frequency[at], p[at]
-        positive = three > 0
-        left, middle, right = jnp.log(jnp.where(positive, three, 1.0))
-        curvature = left - 2 * middle + right
-        top = (middle >= left) & (middle >= right) & (curvature < 0)
-        vertex = (at[1] == k) & jnp.all(positive) & top
-        away = (f[2] - f[0]) / 4 * (left - right) / jnp.where(vertex, curvature, -1.0)
-        return jnp.where(jnp.isnan(p[k]), jnp.nan, frequency[k] + jnp.where(vertex, away, 0.0))
+        away = jnp.where(at[1] == k, _vertex(frequency[at], p[at]), 0.0)
+        return jnp.where(jnp.isnan(p[k]), jnp.nan, frequency[k] + away)
 
     return jax.vmap(one)(power.reshape(-1, len(frequency))).reshape(power.shape[:-1])
+
+
+def _vertex(f: Any, power: Any) -> Any:
+    """How far from the middle one of three bins the parabola through their log powers has its
+    vertex; 0 where a neighbour is larger, or a power is 0."""
+    xp = np if isinstance(power, np.ndarray) else jnp
+    positive = power > 0
+    left, middle, right = xp.log(xp.where(positive, power, 1.0))
+    curvature = left - 2 * middle + right
+    top = (middle >= left) & (middle >= right) & (curvature < 0) & xp.all(positive)
+    # divided by another number where there is none: else the derivative would be NaN there
+    return xp.where(top, (f[2] - f[0]) / 4 * (left - right) / xp.where(top, curvature, -1.0), 0.0)
 
 
 def _peak(
     spectrum: Spectrum, p: Float[np.ndarray, " bins"], k: int | np.integer, prominence: float
 ) -> Peak:
-    f = np.asarray(spectrum.frequency, dtype=float)
-    interpolated = f[k]
-    if 0 < k < p.size - 1 and np.all(p[k - 1 : k + 2] > 0):
-        left, middle, right = np.log(p[k - 1 : k + 2])
-        curvature = left - 2 * middle + right
-        if curvature < 0:
-            interpolated += (f[k + 1] - f[k - 1]) / 4 * (left - right) / curvature
+    f, about = np.asarray(spectrum.frequency, dtype=float), slice(k - 1, k + 2)
+    away = _vertex(f[about], p[about]) if 0 < k < p.size - 1 else 0.0
     number = round(f[k] / spectrum.settings.resolution)
-    return Peak(number, float(f[k]), float(interpolated), float(p[k]), float(prominence))
+    return Peak(number, *map(float, (f[k], f[k] + away, p[k], prominence)))

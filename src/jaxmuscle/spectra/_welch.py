@@ -76,23 +76,23 @@ class Spectrum(Shown, eqx.Module):
         return plot.spectrum(self, ax, log=log, proportional=proportional, label=label)
 
 
+Samples = Real[Array | np.ndarray, "*batch times"]
+Signals = Float[Array, "*batch times"]
+
+
 def is_known(x: Any) -> bool:
     """Whether it is an array with values, and not something that JAX traces or took its place."""
     return isinstance(x, jax.Array | np.ndarray) and is_concrete(x)
 
 
-def floating(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch times"]:
+def floating(signal: Samples) -> Signals:
     """The signal as an array of its own floating dtype; whole numbers get the default one."""
     signal = jnp.asarray(signal)
     samples = signal.ndim >= 1 and signal.shape[-1] >= 1 and not jnp.iscomplexobj(signal)
-    require(
-        samples, "signal", jax.typeof(signal), "give real samples along the last axis, at least one"
-    )
-    return (
-        signal
-        if jnp.issubdtype(signal.dtype, jnp.floating)
-        else signal.astype(jnp.result_type(float))
-    )
+    remedy = "give real samples along the last axis, at least one"
+    require(samples, "signal", jax.typeof(signal), remedy)
+    known = jnp.issubdtype(signal.dtype, jnp.floating)
+    return signal if known else signal.astype(float)
 
 
 def _impulse_response(
@@ -107,9 +107,7 @@ def _along(values: np.ndarray, of: Array) -> Array:
     return jnp.asarray(values, of.dtype).reshape((1,) * (of.ndim - values.ndim) + values.shape)
 
 
-def _convolve(
-    signal: Float[Array, "*batch times"], response: Float[np.ndarray, " times"]
-) -> Float[Array, "*batch times"]:
+def _convolve(signal: Signals, response: Float[np.ndarray, " times"]) -> Signals:
     """y_n = Σ_m h_m x_{n - m}, for as many samples as both have."""
     samples = signal.shape[-1]
     size = scipy.fft.next_fast_len(2 * samples - 1, real=True)
@@ -143,9 +141,7 @@ def lowpass(
 
 
 @kept
-def _lowpass(
-    signal: Real[Array | np.ndarray, "*batch times"], settings: SpectrumSettings
-) -> Float[Array, "*batch times"]:
+def _lowpass(signal: Samples, settings: SpectrumSettings) -> Signals:
     signal, sections = floating(signal), settings.sections
     assert sections is not None
     if settings.filter_direction == "both":
@@ -159,9 +155,7 @@ def _lowpass(
     )
 
 
-def _forward_and_backward(
-    x: Float[Array, "*batch times"], sections: Float[np.ndarray, "sections 6"]
-) -> Float[Array, "*batch times"]:
+def _forward_and_backward(x: Signals, sections: Float[np.ndarray, "sections 6"]) -> Signals:
     first_order = min(np.sum(sections[:, 2] == 0), np.sum(sections[:, 5] == 0))
     edge = 3 * (2 * len(sections) + 1 - int(first_order))
     remedy = (
