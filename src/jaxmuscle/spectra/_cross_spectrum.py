@@ -21,10 +21,10 @@ Times = Float[np.ndarray, " times"]
 class Response(NamedTuple):
     """The response H of an output to an input in the bins that the input excites.
 
-    `input_power` is the input's density, `stderr` the standard error of the real and of the
-    imaginary part of `value`, `correlation` that of the errors of bins, `E e_k e_l* / √(E|e_k|²
-    E|e_l|²)`. `centre` is where the input that a bin sees lies on the average [Hz]: at an edge of
-    the input's band not in the middle of the bin, and to first order `value` is H at the centre.
+    `stderr` is the standard error of the real and of the imaginary part of `value`, `correlation`
+    that of the errors of bins, `E e_k e_l* / √(E|e_k|² E|e_l|²)`. `centre` is where the input that
+    a bin sees lies on the average [Hz]: at an edge of the input's band not in the middle of the
+    bin, and to first order `value` is H at the centre.
     """
 
     frequency: Bins
@@ -32,7 +32,6 @@ class Response(NamedTuple):
     stderr: Bins
     coherence: Bins
     correlation: Complex[np.ndarray, "bins bins"]
-    input_power: Bins
     centre: Bins
 
 
@@ -94,7 +93,6 @@ def response_of(
         stderr=np.sqrt(variance * noise / 2),
         coherence=np.abs(cross) ** 2 / (power * total),
         correlation=v / np.sqrt(np.outer(variance, variance)),
-        input_power=power / count,
         centre=_centres(given, rows.reshape(*shape, n), settings.rate),
     )
 
