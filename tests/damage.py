@@ -140,7 +140,7 @@ def _same_target(target: jm.Target, text: str) -> bool:
     said = tomllib.loads(text)
     power = np.array(said["proportional_power"], float)
     frequency = np.array(said["frequency_hz"], float)
-    settings = target.settings.to_dict(whole=True)
+    settings = target.settings.to_dict()
     if any(not _close(settings[key], value) for key, value in said.get("settings", {}).items()):
         return False
     for key in ("name", "quantity", "provenance", "source", "mvc_fraction", "unit", "reason"):

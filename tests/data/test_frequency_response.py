@@ -47,7 +47,7 @@ def test_gain_phase_and_back():
     np.testing.assert_allclose(response.gain, GAIN)
     np.testing.assert_allclose(response.phase, PHASE)
     np.testing.assert_allclose(response.averages, [10, 20, 30, 40])
-    np.testing.assert_allclose(response.phase_stderr, np.degrees(response.gain_stderr / GAIN))
+    np.testing.assert_allclose(response.phase_stderr, np.degrees(response.stderr / GAIN))
     assert "4 frequencies from 0.5 to 5 Hz" in str(response)
 
 

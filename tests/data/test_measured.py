@@ -209,11 +209,11 @@ DAMAGED = {
     ),
     "a text": (
         {"mean": GOOD | {"stderr": "big"}},
-        "measured.mean: stderr must be a number or nothing, not a text",
+        "measured.mean: stderr must be a number, not a text",
     ),
     "yes": (
         {"mean": GOOD | {"value": True}},
-        "measured.mean: value must be a number or nothing, not true",
+        "measured.mean: value must be a number, not true",
     ),
     "a unit that is none": ({"mean": GOOD | {"unit": 3}}, "measured.mean: unit"),
     "no number": (

@@ -235,9 +235,7 @@ def test_two_parts_in_series_are_not_of_second_order():
     s = 2j * np.pi * f
     inner, outer = 0.5 * s**2 + 60 * s + 200, 5 * s + 200
     exact = inner * outer / (inner + outer) + 0.5 * s**2
-    response = Response(
-        f, exact, 0.02 * np.abs(exact), np.ones(f.size), np.eye(f.size) + 0j, np.ones(f.size), f
-    )
+    response = Response(f, exact, 0.02 * np.abs(exact), np.ones(f.size), np.eye(f.size) + 0j, f)
     fit = second_order_fit(response, True)
     assert f"{fit.value[0]:.0f} {fit.stderr[0]:.0f}" == "144 4"
     assert f"{1e3 * fit.value[3]:.1f} {1e3 * fit.stderr[3]:.1f}" == "-1.2 0.4"

@@ -6,20 +6,16 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 from scipy.special import erf
 
 from jaxmuscle.spectra._measures import (
     approximate_entropy,
     coefficient_of_variation,
-    normalised,
     peak_frequency,
     peaks,
     sample_entropy,
     signal_to_noise,
-    spearman,
 )
-from jaxmuscle.spectra._neighbours import FEW, neighbours
 from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum, spectrum_of
 
@@ -101,25 +97,6 @@ def test_entropy_of_ten_thousand_samples_is_near_that_of_its_parts():
     assert 0 < approximate_entropy(sine) < 0.1 < 2 < approximate_entropy(x)
 
 
-@pytest.mark.parametrize("m", [2, 3])
-@pytest.mark.parametrize("kind", ["noise", "slow", "few values", "mostly constant"])
-def test_neighbours_of_a_long_record_are_those_of_a_tree(kind, m):
-    rng = np.random.default_rng(4)
-    x = rng.standard_normal(FEW + 500)
-    x = {
-        "noise": x,
-        "slow": np.cumsum(x),
-        "few values": np.round(x),
-        "mostly constant": x * (x > 2),
-    }[kind]
-    templates = np.lib.stride_tricks.sliding_window_view(x, m)
-    radius = 1.0 if kind == "few values" else 0.2 * np.std(x)  # whole numbers lie at the very bound
-    tree = KDTree(templates, leafsize=100).query_ball_point(
-        templates, radius, p=np.inf, return_length=True
-    )
-    np.testing.assert_array_equal(neighbours(templates, radius), tree)
-
-
 def test_entropy_does_not_depend_on_unit_or_offset():
     x = RECORDS["walk"]
     assert approximate_entropy(1000 * x - 3) == pytest.approx(approximate_entropy(x), abs=1e-9)
@@ -179,50 +156,6 @@ def test_constant_and_centred_signals(x64):
     assert np.all(jax.grad(coefficient_of_variation)(constant) == 0)
     assert signal_to_noise(constant) == np.inf
     assert coefficient_of_variation(jnp.asarray([-1.0, 1.0])) == np.inf
-
-
-def test_spearman_without_ties_is_the_textbook_formula():
-    a, b = np.array([0.1, 5.0, 3.0, 100.0, -2.0]), np.array([7.0, 8.0, 30.0, 9.0, 1.0])
-    difference = np.array([2, 4, 3, 5, 1]) - np.array([2, 3, 5, 4, 1])
-    assert spearman(a, b) == pytest.approx(1 - 6 * np.sum(difference**2) / (5 * 24), abs=1e-12)
-    assert spearman(a, np.exp(a / 20)) == pytest.approx(1, abs=1e-12)
-    assert spearman(a, -a) == pytest.approx(-1, abs=1e-12)
-
-
-def test_spearman_needs_two_rows_with_ranks():
-    x = np.arange(5.0)
-    for a, b, message in (
-        (x, x[:4], "equally long"),
-        (x[:2], x[:2], "3 or more"),
-        (x, 0 * x, "b=.*not all equal"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            spearman(a, b)
-    with pytest.raises(ValueError, match=r"^a=.*finite"):
-        spearman(np.where(x > 3, np.nan, x), x)
-
-
-def test_normalised(x64):
-    force = np.array([[1.0, 2.0, 3.0], [-4.0, 2.0, -1.0]])
-    np.testing.assert_allclose(normalised(force), [[0.5, 1, 1.5], [4, -2, 1]])
-    np.testing.assert_allclose(normalised(force, "maximum"), [[1 / 3, 2 / 3, 1], [-1, 0.5, -0.25]])
-    np.testing.assert_allclose(normalised(force, "mvc", mvc=40.0), force / 40)
-    assert normalised(force.astype(np.float32), "mvc", mvc=40.0).dtype == jnp.float32
-    slope = jax.grad(lambda mvc: jnp.sum(normalised(force, "mvc", mvc=mvc)))(40.0)
-    assert slope == pytest.approx(-np.sum(force) / 40**2)
-
-
-def test_normalised_needs_its_reference(user_view):
-    force = np.arange(1.0, 4.0)
-    with pytest.raises(ValueError, match=r"by='peak'.*mean, maximum, mvc"):
-        normalised(force, "peak")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match=r"mvc=None.*by='mvc'"):
-        normalised(force, "mvc")
-    with pytest.raises(ValueError, match=r"mvc=40.0.*by='mean'"):
-        normalised(force, mvc=40.0)
-    for mvc in (0.0, -1.0, float("nan")):
-        with pytest.raises(ValueError, match=r"mvc=.*above zero"):
-            normalised(force, "mvc", mvc=mvc)
 
 
 def spectrum(power, settings=None):

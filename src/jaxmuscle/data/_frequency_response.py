@@ -181,11 +181,6 @@ class FrequencyResponse(Shown, eqx.Module):
         return np.degrees(np.angle(self.value))
 
     @property
-    def gain_stderr(self) -> Bins:
-        """Standard error of the gain [N/m]."""
-        return self.stderr
-
-    @property
     def phase_stderr(self) -> Bins:
         """Standard error of the phase [deg], to first order in stderr / gain."""
         return np.degrees(self.stderr / self.gain)

@@ -14,18 +14,19 @@ from jaxmuscle.spectra._cross_spectrum import Response
 SURE, WORSE = 4.0, 2.0
 
 
+Parameters = Float[np.ndarray, " parameters"]
+
+
 class SecondOrder(NamedTuple):
     """`value` and `stderr` of K [N/m], B [N s/m], I [kg] and, if fitted, of the delay τ [s]; chi²
     over its expectation."""
 
-    value: Float[np.ndarray, " parameters"]
-    stderr: Float[np.ndarray, " parameters"]
+    value: Parameters
+    stderr: Parameters
     chi2: float
 
 
-def second_order_shape(
-    frequency: Float[np.ndarray, " bins"], parameters: Float[np.ndarray, " parameters"]
-) -> np.ndarray:
+def second_order_shape(frequency: Float[np.ndarray, " bins"], parameters: Parameters) -> np.ndarray:
     """H = (K + iωB - ω²I) e^{-iωτ} [N/m], ω = 2πf; τ = 0 if there are three parameters."""
     k, b, i, *delay = parameters
     s = 2j * np.pi * frequency
@@ -38,18 +39,14 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     The errors take the correlation of neighbouring bins into account. Where chi² is more than it
     should be, since the muscle has another shape, they are multiplied by √(chi² / its expectation).
     """
-    f, weight = response.centre, 1 / np.concatenate([response.stderr] * 2)
+    f, weight = response.centre, 1 / np.tile(response.stderr, 2)
     count = 3 + delayed
-    require(
-        2 * f.size > count,
-        "bins",
-        f.size,
-        "too few for a fit; excite a wider band, or take longer segments",
-    )
+    remedy = "too few for a fit; excite a wider band, or take longer segments"
+    require(2 * f.size > count, "bins", f.size, remedy)
     scale, shapes = _terms(response)
     scale = np.append(scale, 1 / (2 * np.pi * f.max()))[:count]
 
-    def residuals(x: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " twice"]:
+    def residuals(x: Parameters) -> Float[np.ndarray, " twice"]:
         return parts(second_order_shape(f, x * scale) - response.value) * weight
 
     start = np.linalg.lstsq(shapes, parts(response.value) * weight)[0]
@@ -59,8 +56,10 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     inverse = np.linalg.pinv(found.jac.T @ found.jac)
     c = response.correlation
     covariance = np.block([[np.real(c), -np.imag(c)], [np.imag(c), np.real(c)]])
-    spread = inverse @ found.jac.T @ covariance @ found.jac @ inverse
-    expected = 2 * f.size - np.trace(inverse @ found.jac.T @ covariance @ found.jac)
+    # neighbouring bins share errors, which the weights of the fit leave out
+    inner = found.jac.T @ covariance @ found.jac
+    spread = inverse @ inner @ inverse
+    expected = 2 * f.size - np.trace(inverse @ inner)
     chi2 = float(2 * found.cost / expected)
     return SecondOrder(found.x * scale, np.sqrt(np.diag(spread) * max(chi2, 1.0)) * scale, chi2)
 
@@ -90,11 +89,9 @@ def lengthens(response: Response) -> float:
     A spring, a damper and a mass, none of them negative, are fitted to H and to -H. Over the chi²
     of the better one for each number, where that is more than 1.
     """
-    shapes, values = (
-        _terms(response)[1],
-        parts(response.value) / np.concatenate([response.stderr] * 2),
-    )
-    as_it_is, turned = (scipy.optimize.nnls(shapes, sign * values)[1] ** 2 for sign in (1, -1))
+    values = parts(response.value) / np.tile(response.stderr, 2)
+    signed = (scipy.optimize.nnls(_terms(response)[1], sign * values)[1] for sign in (1, -1))
+    as_it_is, turned = (norm**2 for norm in signed)
     return float((turned - as_it_is) / max(1.0, min(turned, as_it_is) / values.size))
 
 
@@ -103,7 +100,7 @@ def _terms(response: Response) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarra
     f = response.centre
     scale = np.abs(response.value).max() / (2 * np.pi * f.max()) ** np.arange(3)
     shapes = np.stack([parts(second_order_shape(f, unit * scale)) for unit in np.eye(3)], axis=1)
-    return scale, shapes / np.concatenate([response.stderr] * 2)[:, None]
+    return scale, shapes / np.tile(response.stderr, 2)[:, None]
 
 
 def parts(values: Complex[np.ndarray, " bins"]) -> Float[np.ndarray, " twice"]:

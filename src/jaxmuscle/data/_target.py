@@ -234,22 +234,13 @@ class Target(Shown, eqx.Module):
         if self.mean is None or self.unit not in NEWTONS or self.quantity != "force":
             return None
         means = NEWTONS[self.unit] * np.asarray(self.mean)
-        relative = MEAN_ERROR
-        if (
-            self.segments is not None
-            and self.coefficient_of_variation is not None
-            and self.bins.size
-        ):
-            density = (
-                np.mean(np.square(self.coefficient_of_variation))
-                * self.proportional_power[0]
-                / self.settings.resolution
-            )
+        relative, varied = MEAN_ERROR, self.coefficient_of_variation
+        if self.segments is not None and varied is not None and self.bins.size:
+            share = self.proportional_power[0] / self.settings.resolution
             time = len(self.segments) * trial_samples(self) / self.settings.rate
-            relative = np.sqrt(density / (2 * time))
-        return float(means.mean()), float(
-            mean_error(means, max(relative, LEAST_MEAN_ERROR) * means.mean())
-        )
+            relative = np.sqrt(np.mean(np.square(varied)) * share / (2 * time))
+        mean = float(means.mean())
+        return mean, float(mean_error(means, max(relative, LEAST_MEAN_ERROR) * mean))
 
     def data(self) -> TargetData:
         """What `log_likelihood` asks of the target, as arrays alone: a pytree for `jax.jit`,
@@ -303,7 +294,7 @@ class Target(Shown, eqx.Module):
             "dispersion": self.dispersion if self.trial_power is None else None,
             "measured": None if self.measures is None else check.measured_table(self.measures),
             "stiffness": None if self.stiffness is None else self.stiffness.to_table(),
-            "settings": self.settings.to_dict(whole=whole),
+            "settings": self.settings.to_dict(),
         }
         values = ((key, said[key] if key in said else getattr(self, key)) for key in check.FIELDS)
         table = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values}
@@ -316,8 +307,8 @@ class Target(Shown, eqx.Module):
         file = "target_table"
         fields = check.fields_of(table, file, whole=whole)
         fields = {key: value for key, value in fields.items() if value is not None}
-        names = SpectrumSettings.names(whole=True) if whole else ()
-        settings = check.settings_of(fields.pop("settings", {}), f"{file}.settings", names)
+        stated = fields.pop("settings", {})
+        settings = check.settings_of(stated, f"{file}.settings", whole=whole)
         key = "frequency_hz"
         frequency = check.numbers_of(key, fields.pop(key), file, empty="stiffness" in fields)
         with np.errstate(over="ignore"):
@@ -351,25 +342,21 @@ class Target(Shown, eqx.Module):
         f, p, settings = self.frequency, self.proportional_power, self.settings
         known = [("source", self.source)]
         if f.size:
-            peak = int(np.argmax(p))
+            top, bins = int(np.argmax(p)), f"{f.size} of {settings.frequency.size}"
             known += [
                 ("spectrum", settings.name or "settings of its own"),
-                ("bins", f"{f.size} of {settings.frequency.size}, {f[0]:.3f} to {f[-1]:.3f} Hz"),
-                ("maximum", f"{p[peak]:.3f} at {f[peak]:.3f} Hz"),
+                ("bins", f"{bins}, {f[0]:.3f} to {f[-1]:.3f} Hz"),
+                ("maximum", f"{p[top]:.3f} at {f[top]:.3f} Hz"),
             ]
         if self.stiffness is not None:
             at = self.stiffness.frequency
             known.append(("dynamic stiffness", f"{at.size} points, {at[0]:.3g} to {at[-1]:.3g} Hz"))
         if self.segments is not None:
-            known.append(
-                (
-                    "segments",
-                    f"{_words(self.segments)} ({self.degrees_of_freedom:.1f} degrees of freedom)",
-                )
-            )
+            count = f"({self.degrees_of_freedom:.1f} degrees of freedom)"
+            known.append(("segments", f"{_words(self.segments)} {count}"))
         if self.coefficient_of_variation is not None:
-            variation = ", ".join(f"{100 * value:.3g} %" for value in self.coefficient_of_variation)
-            known.append(("coefficient of variation", variation))
+            each = (f"{100 * value:.3g} %" for value in self.coefficient_of_variation)
+            known.append(("coefficient of variation", ", ".join(each)))
         if self.mvc_fraction is not None:
             known.append(("level", f"{100 * self.mvc_fraction:.4g} % MVC"))
         if self.mean is not None:

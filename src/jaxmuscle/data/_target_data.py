@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmuscle._common.errors import TargetError
-from jaxmuscle.spectra._bin_law import recorded_interval, samples_of, target_law
-from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings, samples_in
+from jaxmuscle.spectra._bin_law import recorded_interval, samples_of_trials, target_law
+from jaxmuscle.spectra._settings import SpectrumSettings
 
 FEWEST = 4096  # samples: a program serves so many, or 4, 16 ... times as many, and all below
 
@@ -61,9 +61,13 @@ class TargetData(eqx.Module):
     @classmethod
     def of(cls, target: Any) -> "TargetData":
         """Of a target. Raises `TargetError` for a spectrum without segments."""
-        settings, counts, bins = target.settings, target.segments, len(target.bins)
-        half, precision, logdet = np.zeros(0), np.zeros((0, 0)), np.zeros(())
-        if bins:
+        settings, counts, values = (
+            target.settings,
+            target.segments,
+            target.coefficient_of_variation,
+        )
+        half, precision, logdet, stiffness = np.zeros(0), np.zeros((0, 0)), np.zeros(()), None
+        if len(target.bins):
             if counts is None:
                 raise TargetError(
                     f"{target.name}: does not state its segments, so how its bins scatter is not"
@@ -71,29 +75,24 @@ class TargetData(eqx.Module):
                 )
             law = target_law(target)
             half, (precision, logdet) = law.degrees / 2, precision_of(law.correlation)
-        samples = np.array(
-            [samples_in(WINDOW, settings)]
-            if counts is None
-            else [samples_of(count, settings) for count in counts]
-        )
-        values, measured, stiffness = target.coefficient_of_variation, target.stiffness, None
-        if measured is not None:
-            known = measured.known
+        if target.stiffness is not None:
+            known = target.stiffness.known
             parts = np.stack([np.real(known.value), np.imag(known.value)])
             stiffness = Stiffness(known.frequency, parts, known.stderr)
+        samples = samples_of_trials(target)
         return cls(
-            settings,
-            longest(int(samples.max())),
-            target.bins - settings.first_bin,
-            np.log(target.proportional_power),
-            half,
-            precision,
-            logdet,
-            samples,
-            np.asarray(recorded_interval(target, settings)),
+            settings=settings,
+            longest=longest(max(samples)),
+            chosen=target.bins - settings.first_bin,
+            log_power=np.log(target.proportional_power),
+            half=half,
+            precision=precision,
+            logdet=logdet,
+            samples=np.array(samples),
+            recorded=np.asarray(recorded_interval(target, settings)),
             # without segments nothing says how much it scatters
-            None if values is None or counts is None else np.log(np.asarray(values)),
-            stiffness,
+            log_variation=None if None in (values, counts) else np.log(np.asarray(values)),
+            stiffness=stiffness,
         )
 
 

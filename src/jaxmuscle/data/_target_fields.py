@@ -2,7 +2,7 @@
 stored form, or an error that says what is right."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from numbers import Integral, Real
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
@@ -174,10 +174,10 @@ class MeasureTable(Table):
 
     unit: str
     error_from: str
-    value: float | None = None
-    stderr: float | None = None
-    low: float | None = None
-    high: float | None = None
+    value: float = math.nan
+    stderr: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
 
 
 def _measures(name: str, value: Any) -> tuple[tuple[Any, ...], ...]:
@@ -194,9 +194,9 @@ def _measures(name: str, value: Any) -> tuple[tuple[Any, ...], ...]:
             raise TargetError(f"{where}: needs a table with the keys {', '.join(MEASURED)}")
         said = dict(given.row() if isinstance(given, Measure) else given)
         row = msgspec.structs.asdict(checked(said, MeasureTable, where, TargetError))
-        if (row["low"] is None) != (row["high"] is None):
+        if is_real(row["low"]) != is_real(row["high"]):
             raise TargetError(f"{where}: give both low and high, or neither")
-        # a `Measure` says with NaN what does not exist
+        # NaN is what does not exist
         known = (v if isinstance(v, str) or is_real(v) else None for v in map(row.get, MEASURED))
         rows.append((quantity, *known))
     return tuple(rows)
@@ -364,7 +364,7 @@ def fields_of(table: Mapping[str, Any], file: str, *, whole: bool = False) -> di
         raise TargetError(f"{file}: {error}") from None
 
 
-def settings_of(table: Any, where: str, needed: Iterable[str] = ()) -> SpectrumSettings:
+def settings_of(table: Any, where: str, *, whole: bool = False) -> SpectrumSettings:
     """Spectrum settings of a target's table. Raises `TargetError`."""
     if not isinstance(table, dict):
         raise TargetError(
@@ -376,7 +376,7 @@ def settings_of(table: Any, where: str, needed: Iterable[str] = ()) -> SpectrumS
             " the line [settings]: below it everything counts as a setting"
         )
     try:
-        return SpectrumSettings.from_dict(table, needed=needed)
+        return SpectrumSettings.from_dict(table, whole=whole)
     except ValueError as error:
         raise TargetError(f"{where}: {error}") from None
 

@@ -92,7 +92,7 @@ def _to_table(value: Any) -> Any:
     if value is None:
         return ABSENT
     if isinstance(value, SpectrumSettings):
-        return value.to_dict(whole=True)
+        return value.to_dict()
     if isinstance(value, eqx.Module):
         if _known().get(type(value).__name__) is not type(value):
             _refuse(value)
@@ -190,7 +190,7 @@ def _value(kind: type, field: Any, value: Any, where: str, whole: bool) -> Any:
 
 def _settings(table: dict[str, Any], where: str, whole: bool) -> SpectrumSettings:
     try:
-        return SpectrumSettings.from_dict(table, needed=SpectrumSettings.names(whole=whole))
+        return SpectrumSettings.from_dict(table, whole=whole)
     except ValueError as error:
         raise PresetError(f"{where}: {error}") from None
 

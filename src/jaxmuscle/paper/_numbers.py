@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float
 
 from jaxmuscle.data._recording import RECORDED, Recording
@@ -17,7 +18,7 @@ from jaxmuscle.model._tasks import AbstractTask, PrescribedForce
 from jaxmuscle.model._white_noise import OrnsteinUhlenbeckNoise
 from jaxmuscle.response._presets import load_preset
 from jaxmuscle.simulation._trajectory import Trajectory, stack
-from jaxmuscle.spectra._measures import approximate_entropy, peaks, spearman
+from jaxmuscle.spectra._measures import approximate_entropy, peaks
 from jaxmuscle.spectra._settings import WINDOW
 from jaxmuscle.spectra._welch import Spectrum, lowpass
 
@@ -113,12 +114,16 @@ class Experiment(eqx.Module):
     @property
     def rho_fft(self) -> tuple[float, ...]:
         """Spearman correlation of the FFT power of each pair."""
-        return tuple(spearman(a.power, b.power) for a, b in itertools.combinations(self.fft, 2))
+        return self._rho(self.fft)
 
     @property
     def rho_welch(self) -> tuple[float, ...]:
         """Spearman correlation of the Welch power of each pair."""
-        return tuple(spearman(a.power, b.power) for a, b in itertools.combinations(self.welch, 2))
+        return self._rho(self.welch)
+
+    def _rho(self, spectra: tuple[Spectrum, ...]) -> tuple[float, ...]:
+        powers = ((a.power, b.power) for a, b in itertools.combinations(spectra, 2))
+        return tuple(float(scipy.stats.spearmanr(*pair).statistic) for pair in powers)
 
 
 def run_preset(task: AbstractTask) -> Tuned:

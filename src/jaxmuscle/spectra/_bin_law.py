@@ -19,12 +19,17 @@ ENOUGH = 3  # trials, for their scatter to say what the error of their mean is
 NORMAL = 1.96  # standard errors to either side that hold 95 %
 
 
+Bins = Float[np.ndarray, " bins"]
+BinMatrix = Float[np.ndarray, "bins bins"]
+BinRows = Float[np.ndarray, "*rows bins"]
+
+
 class BinLaw(NamedTuple):
     """Sampling law of Welch powers: equivalent degrees of freedom ν of every bin, and the
     correlation of bins."""
 
-    degrees: Float[np.ndarray, " bins"]
-    correlation: Float[np.ndarray, "bins bins"]
+    degrees: Bins
+    correlation: BinMatrix
 
 
 def welch_law(settings: SpectrumSettings, bins: np.ndarray, segments: tuple[int, ...]) -> BinLaw:
@@ -49,16 +54,13 @@ def _welch_law(
     covariance, rows = np.zeros((len(rows), len(rows))), rows.reshape(-1, n)
     for count, trials in Counter(segments).items():
         reach = min(count - 1, (n - 1) // step)
-        for j in range(-reach, reach + 1):
-            near, far = (rows[:, abs(j) * step :], rows[:, : n - abs(j) * step])[
-                :: 1 if j >= 0 else -1
-            ]
-            both = (
-                (np.abs(near @ far.conj().T) ** 2 + np.abs(near @ far.T) ** 2)
-                .reshape(shape * 2)
-                .sum(axis=(1, 3))
-            )
-            covariance += trials * count * (1 - abs(j) / count) / sum(segments) ** 2 * both
+        for j in range(reach + 1):
+            later, earlier = rows[:, j * step :], rows[:, : n - j * step]
+            both = np.abs(later @ earlier.conj().T) ** 2 + np.abs(later @ earlier.T) ** 2
+            both = both.reshape(shape * 2).sum(axis=(1, 3))
+            # segments j before are those j after, with the bins exchanged
+            both = both + both.T if j else both
+            covariance += trials * count * (1 - j / count) / sum(segments) ** 2 * both
     sd = np.sqrt(np.diag(covariance))
     return BinLaw(2 * power**2 / sd**2, covariance / np.outer(sd, sd))
 
@@ -152,14 +154,14 @@ class BinStatistics(NamedTuple):
     `correlation` have leading axes where the line's share had.
     """
 
-    bias: Float[np.ndarray, "*rows bins"]
-    sd: Float[np.ndarray, "*rows bins"]
-    correlation: Float[np.ndarray, "bins bins"]
-    half: Float[np.ndarray, "*rows bins"]
+    bias: BinRows
+    sd: BinRows
+    correlation: BinMatrix
+    half: BinRows
     known: bool
 
     @property
-    def covariance(self) -> Float[np.ndarray, "bins bins"]:
+    def covariance(self) -> BinMatrix:
         """Covariance of the log powers."""
         return self.sd[:, None] * self.correlation * self.sd
 
@@ -171,9 +173,7 @@ def log_power_moments(degrees_of_freedom: Any) -> tuple[Any, Any]:
     return digamma(half) - np.log(half), polygamma(1, half)
 
 
-def bin_statistics(
-    target: Any, line_share: Float[np.ndarray, "*rows bins"] | None = None
-) -> BinStatistics:
+def bin_statistics(target: Any, line_share: BinRows | None = None) -> BinStatistics:
     """Statistics of a target's log powers: from its segments by `welch_law`, else from its sigma,
     else unknown (sd 1).
 
@@ -182,18 +182,17 @@ def bin_statistics(
     """
     n = len(target.bins)
     share = np.zeros(n) if line_share is None else np.asarray(line_share)
-    unknown = np.full(share.shape, np.nan)
+    bias, sd, correlation, known = np.zeros(share.shape), np.ones(share.shape), np.eye(n), n == 0
+    half = np.full(share.shape, np.nan)
     if target.segments is not None:
-        law = target_law(target)
+        law, known = target_law(target), True
         degrees = law.degrees / np.maximum(1 - share**2, LEAST)
         bias, variance = log_power_moments(degrees)
-        return BinStatistics(bias, np.sqrt(variance), law.correlation, degrees / 2, True)
-    if target.sigma is not None:
-        sd = np.sqrt(np.log1p((target.sigma / target.proportional_power) ** 2))
-        return BinStatistics(
-            np.zeros(share.shape), np.broadcast_to(sd, share.shape), np.eye(n), unknown, True
-        )
-    return BinStatistics(np.zeros(share.shape), np.ones(share.shape), np.eye(n), unknown, n == 0)
+        sd, correlation, half = np.sqrt(variance), law.correlation, degrees / 2
+    elif target.sigma is not None:
+        variance = np.log1p((target.sigma / target.proportional_power) ** 2)
+        sd, known = np.broadcast_to(np.sqrt(variance), share.shape), True
+    return BinStatistics(bias, sd, correlation, half, known)
 
 
 def samples_of(segments: int, settings: SpectrumSettings) -> int:
@@ -202,12 +201,16 @@ def samples_of(segments: int, settings: SpectrumSettings) -> int:
     return min(settings.length - settings.step // 2 + segments * settings.step, LONGEST)
 
 
-def trial_samples(target: Any) -> int:
-    """Samples of a trial of a target, the average of several; of 10 s where it states no
-    segments."""
+def samples_of_trials(target: Any) -> list[int]:
+    """Samples of each trial of a target; of 10 s where it states no segments."""
     if target.segments is None:
-        return samples_in(WINDOW, target.settings)
-    return round(np.mean([samples_of(k, target.settings) for k in target.segments]))
+        return [samples_in(WINDOW, target.settings)]
+    return [samples_of(count, target.settings) for count in target.segments]
+
+
+def trial_samples(target: Any) -> int:
+    """Samples of a trial of a target, the average of several."""
+    return round(np.mean(samples_of_trials(target)))
 
 
 def recorded_interval(data: Any, settings: SpectrumSettings) -> float:
@@ -218,10 +221,10 @@ def recorded_interval(data: Any, settings: SpectrumSettings) -> float:
 
 
 def standardised(
-    target_power: Float[np.ndarray, " bins"],
-    fitted: Float[np.ndarray, " bins"],
+    target_power: Bins,
+    fitted: Bins,
     statistics: BinStatistics,
-) -> Float[np.ndarray, " bins"]:
+) -> Bins:
     """`(z_k - z̄) / sd_k` with `z_k = ln(target_k / fitted_k) - bias_k`."""
     z = np.log(target_power) - np.log(fitted) - statistics.bias
     if not z.size:
@@ -229,12 +232,12 @@ def standardised(
     return (z - z.mean()) / statistics.sd
 
 
-def shares_map(p: Float[np.ndarray, " bins"]) -> Float[np.ndarray, "bins bins"]:
+def shares_map(p: Bins) -> BinMatrix:
     """Derivative of proportional powers with respect to log powers, `diag(p) - p pᵀ`."""
     return np.diag(p) - np.outer(p, p)
 
 
-def sides_of(settings: SpectrumSettings) -> Float[np.ndarray, " bins"]:
+def sides_of(settings: SpectrumSettings) -> Bins:
     """How often a bin counts, once or for both signs of its frequency, over the rate [1/Hz]."""
     k = np.arange(settings.first_bin, settings.last_bin + 1)
     return np.where((k == 0) | (2 * k == settings.length), 1.0, 2.0) / settings.rate

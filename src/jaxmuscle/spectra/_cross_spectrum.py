@@ -14,26 +14,29 @@ LEAST_INPUT = 1e-4  # of the largest density of the input
 FEWEST = 3  # segments times tapers
 
 
+Bins = Float[np.ndarray, " bins"]
+Times = Float[np.ndarray, " times"]
+
+
 class Response(NamedTuple):
     """The response H of an output to an input in the bins that the input excites.
 
-    `input_power` is the input's density, `stderr` the standard error of the real and of the
-    imaginary part of `value`, `correlation` that of the errors of bins, `E e_k e_l* / √(E|e_k|²
-    E|e_l|²)`. `centre` is where the input that a bin sees lies on the average [Hz]: at an edge of
-    the input's band not in the middle of the bin, and to first order `value` is H at the centre.
+    `stderr` is the standard error of the real and of the imaginary part of `value`, `correlation`
+    that of the errors of bins, `E e_k e_l* / √(E|e_k|² E|e_l|²)`. `centre` is where the input that
+    a bin sees lies on the average [Hz]: at an edge of the input's band not in the middle of the
+    bin, and to first order `value` is H at the centre.
     """
 
-    frequency: Float[np.ndarray, " bins"]
+    frequency: Bins
     value: Complex[np.ndarray, " bins"]
-    stderr: Float[np.ndarray, " bins"]
-    coherence: Float[np.ndarray, " bins"]
+    stderr: Bins
+    coherence: Bins
     correlation: Complex[np.ndarray, "bins bins"]
-    input_power: Float[np.ndarray, " bins"]
-    centre: Float[np.ndarray, " bins"]
+    centre: Bins
 
 
 def ordinates(
-    signal: Float[np.ndarray, " times"], settings: SpectrumSettings
+    signal: Times, settings: SpectrumSettings
 ) -> Complex[np.ndarray, "segments bins tapers"]:
     """The transforms of all segments, detrended and tapered; the mean of their squares, added over
     tapers, is the density.
@@ -42,18 +45,16 @@ def ordinates(
     """
     count, rows, n = settings.segments(signal.size), bin_rows(settings), settings.length
     needed = n + (-(-FEWEST // settings.tapers) - 1) * settings.step
-    remedy = (
-        f"a frequency response needs {needed} at {settings.rate:g} Hz, {needed / settings.rate:g}"
-        " s; give a longer window"
-    )
+    seconds = f"{needed} at {settings.rate:g} Hz, {needed / settings.rate:g} s"
+    remedy = f"a frequency response needs {seconds}; give a longer window"
     require(count * settings.tapers >= FEWEST, "samples", signal.size, remedy)
     pieces = signal[settings.step * np.arange(count)[:, None] + np.arange(n)]
-    return (pieces @ rows.reshape(-1, n).T).reshape(count, *rows.shape[:2])
+    return np.tensordot(pieces, rows, (1, 2))
 
 
 def response_of(
-    given: Float[np.ndarray, " times"],
-    output: Float[np.ndarray, " times"],
+    given: Times,
+    output: Times,
     settings: SpectrumSettings,
 ) -> Response:
     """The least-squares response `H_k = Σ X* Y / Σ |X|²` over segments and tapers, with the errors
@@ -76,40 +77,30 @@ def response_of(
     x, y, power, rows = x[:, kept], y[:, kept], power[kept], bin_rows(settings)[kept]
     shape, flat, rows = rows.shape[:2], x.reshape(count, -1), rows.reshape(-1, n)
     v = np.zeros((shape[0], shape[0]), complex)
+    # segments further apart share no samples
     for j in range(min(count - 1, (n - 1) // step) + 1):
         shared = rows[:, j * step :] @ rows[:, : n - j * step].conj().T
         part = (flat[: count - j].conj().T @ flat[j:] * shared).reshape(shape * 2).sum(axis=(1, 3))
         v += part if j == 0 else part + part.conj().T
     v /= np.outer(power, power)
+    variance = np.real(np.diag(v))
     cross, total = np.sum(x.conj() * y, axis=(0, 2)), np.sum(np.abs(y) ** 2, axis=(0, 2))
-    expected = (
-        count * np.sum(np.abs(rows) ** 2, axis=1).reshape(shape).sum(axis=1)
-        - np.real(np.diag(v)) * power
-    )
+    expected = count * np.sum(np.abs(rows.reshape(*shape, n)) ** 2, axis=(1, 2)) - variance * power
     noise = np.maximum(total - np.abs(cross) ** 2 / power, 0.0) / expected
-    sd = np.sqrt(np.real(np.diag(v)))
     return Response(
-        settings.frequency[kept],
-        cross / power,
-        sd * np.sqrt(noise / 2),
-        np.abs(cross) ** 2 / (power * total),
-        v / np.outer(sd, sd),
-        power / count,
-        _centres(given, rows.reshape((*shape, n)), settings.rate),
+        frequency=settings.frequency[kept],
+        value=cross / power,
+        stderr=np.sqrt(variance * noise / 2),
+        coherence=np.abs(cross) ** 2 / (power * total),
+        correlation=v / np.sqrt(np.outer(variance, variance)),
+        centre=_centres(given, rows.reshape(*shape, n), settings.rate),
     )
 
 
-def _centres(
-    given: Float[np.ndarray, " times"], rows: Complex[np.ndarray, "bins tapers n"], rate: float
-) -> Float[np.ndarray, " bins"]:
+def _centres(given: Times, rows: Complex[np.ndarray, "bins tapers n"], rate: float) -> Bins:
     """`Σ f |W_k(f)|² S(f) / Σ |W_k(f)|² S(f)`, S the input's periodogram, W_k the transform of a
     bin's rows."""
-    density, f = (
-        np.abs(np.fft.rfft(given - given.mean())) ** 2,
-        np.fft.rfftfreq(given.size, 1 / rate),
-    )
-    seen = [
-        np.sum(np.abs(np.fft.fft(row.conj(), given.size)[:, : f.size]) ** 2, axis=0) * density
-        for row in rows
-    ]
-    return np.array([share @ f / share.sum() for share in seen])
+    f, n = np.fft.rfftfreq(given.size, 1 / rate), given.size
+    density = np.abs(np.fft.rfft(given - given.mean())) ** 2
+    seen = (np.sum(np.abs(np.fft.fft(row.conj(), n)[:, : f.size]) ** 2, axis=0) for row in rows)
+    return np.array([(share * density) @ f / (share @ density) for share in seen])

@@ -3,16 +3,14 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.arrays import is_concrete
 from jaxmuscle._common.cards import Card, Shown, facts
 
 from ._settings import SpectrumSettings
-from ._welch import Spectrum
+from ._welch import Spectrum, is_known
 
 Bins = Float[Array | np.ndarray, " bins"]
 
@@ -38,7 +36,7 @@ class SpectrumEstimate(Shown, eqx.Module):
 
     def _card(self) -> Card:
         numbers = (self.power, self.stderr, self.plain_stderr)
-        if not all(isinstance(x, jax.Array | np.ndarray) and is_concrete(x) for x in numbers):
+        if not all(map(is_known, numbers)):
             return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
         power, *errors = (np.asarray(x) for x in numbers)
         error, plain = (100 * float(np.median(each / power)) for each in errors)
@@ -92,38 +90,14 @@ def estimated(
     count = len(plain)
 
     def summary(rows):
-        error = (
-            rows.std(axis=0, ddof=1) / count**0.5 if count > 1 else np.full(rows.shape[1], np.nan)
-        )
-        return rows.mean(axis=0), error
+        known = count > 1
+        spread = rows.std(axis=0, ddof=1) if known else np.full(rows.shape[1], np.nan)
+        return rows.mean(axis=0), spread / count**0.5
 
-    control = None if beside is None or expected is None else (*summary(plain - beside), expected)
-    return from_moments(summary(plain), control, count, settings, unit)
-
-
-def from_moments(
-    plain: tuple[Bins, Bins],
-    control: tuple[Bins, Bins, Bins] | None,
-    seeds: int,
-    settings: SpectrumSettings,
-    unit: str,
-) -> SpectrumEstimate:
-    """From means and standard errors: of the Welch power, and of what the linearised task leaves of
-    it, whose exact expectation is the third of `control`."""
-    mean, error = plain
-    if control is None:
-        return SpectrumEstimate(
-            settings.frequency, mean, error, mean, error, None, seeds, settings, unit
-        )
-    difference, stderr, expected = control
-    return SpectrumEstimate(
-        settings.frequency,
-        expected + difference,
-        stderr,
-        mean,
-        error,
-        expected,
-        seeds,
-        settings,
-        unit,
-    )
+    power, stderr = mean, error = summary(plain)
+    if beside is not None and expected is not None:
+        difference, stderr = summary(plain - beside)
+        power = expected + difference
+    known = None if beside is None else expected
+    own = (power, stderr, mean, error, known, count)
+    return SpectrumEstimate(settings.frequency, *own, settings, unit)

@@ -1,25 +1,22 @@
-"""Numbers that describe a force record and its spectrum: variability, regularity, rank correlation,
-peaks."""
+"""Numbers that describe a force record and its spectrum: variability, regularity, peaks."""
 
-from typing import Any, Literal, get_args
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Bool, Float, Int, Real
 
 from jaxmuscle._common.arguments import require
 from jaxmuscle._common.arrays import all_concrete, as_arrays
 from jaxmuscle._common.programs import kept
 
 from ._fluctuations import one_record
-from ._neighbours import neighbours
 from ._welch import Spectrum, floating
 
-Reference = Literal["mean", "maximum", "mvc"]
+Counts = Int[np.ndarray, " _"]
 
 
 def _standard_deviation(signal: Float[Array, "*batch times"]) -> Float[Array, "*batch"]:
@@ -66,29 +63,24 @@ def signal_to_noise(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[A
     return jnp.mean(signal, axis=-1) / _standard_deviation(signal)
 
 
-def _record(
-    signal: Real[Array | np.ndarray, "..."], m: int, tolerance: float
-) -> tuple[np.ndarray, float]:
-    """One checked record, and the radius within which its templates match."""
-    require(m >= 1, "m", m, "give the template length, at least 1")
-    require(
-        0 < tolerance < np.inf, "tolerance", tolerance, "give a positive fraction of the deviation"
-    )
-    x = one_record(signal, m + 2, "m + 2 = ")
-    return x, tolerance * float(np.std(x))
-
-
-def _templates(x: Float[np.ndarray, " times"], m: int) -> Float[np.ndarray, "templates m"]:
-    return np.lib.stride_tricks.sliding_window_view(x, m)
-
-
-def _counts(signal: Any, m: int, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _counts(
+    x: Float[np.ndarray, " times"], m: int, radius: float
+) -> tuple[Counts, Counts, Bool[np.ndarray, " templates"]]:
     """How many templates of m, and of m + 1 samples, match each of their kind, and which of those
     of m match the last."""
-    x, radius = _record(signal, m, tolerance)
-    shorter, longer = (_templates(x, length) for length in (m, m + 1))
-    last = np.max(np.abs(shorter - shorter[-1]), axis=1) <= radius
-    return neighbours(shorter, radius), neighbours(longer, radius), last
+    n, order = x.size, np.argsort(x, kind="stable")
+    ranks = np.empty(n, np.int32)
+    ranks[order] = np.arange(n)
+    low = np.searchsorted(x[order], x - radius).astype(np.int32)
+    width = (np.searchsorted(x[order], x + radius, side="right") - low).astype(np.uint32)
+    counts, last = np.zeros((m + 1, n), int), [np.zeros(n - k, bool) for k in range(m + 1)]
+    for i in range(n):
+        # those below the lower bound wrap around to large numbers: one comparison for both bounds
+        near = (ranks - low[i]).view(np.uint32) < width[i]
+        # which templates of k + 1 samples match the one that ends with sample i
+        last = [near, *(last[k - 1][:-1] & near[k:] for k in range(1, m + 1))]
+        counts[:, i] = [np.count_nonzero(match) for match in last]
+    return counts[m - 1, m - 1 :], counts[m, m:], last[m - 1]
 
 
 def regularity(
@@ -96,8 +88,13 @@ def regularity(
 ) -> tuple[float, float]:
     """`approximate_entropy` and `sample_entropy`, for which the templates are compared only
     once."""
-    shorter, longer, last = _counts(signal, m, tolerance)
+    require(m >= 1, "m", m, "give the template length, at least 1")
+    remedy = "give a positive fraction of the deviation"
+    require(0 < tolerance < np.inf, "tolerance", tolerance, remedy)
+    x = one_record(signal, m + 2, "m + 2 = ")
+    shorter, longer, last = _counts(x, m, tolerance * float(np.std(x)))
     phi, phi_longer = (float(np.mean(np.log(count / len(count)))) for count in (shorter, longer))
+    # those that begin with the last m samples, which none of m + 1 do, and each with itself
     b, a = int(np.sum(shorter[:-1] - 1) - np.sum(last[:-1])), int(np.sum(longer - 1))
     none = float("nan") if b == 0 else float("inf")
     return phi - phi_longer, none if a == 0 else float(np.log(b / a))
@@ -146,68 +143,6 @@ def sample_entropy(
     **Source:** Richman & Moorman 2000, doi:10.1152/ajpheart.2000.278.6.H2039.
     """
     return regularity(signal, m, tolerance)[1]
-
-
-def spearman(a: Real[Array | np.ndarray, "..."], b: Real[Array | np.ndarray, "..."]) -> float:
-    """Spearman's rank correlation, for instance between the spectra of two people. Not traceable.
-
-        jm.spectra.spearman(np.arange(30.0), np.arange(30.0) ** 2)  # 1.0
-
-    **Arguments:** `a`, `b` (bins,), paired values in any units.
-
-    **Returns:** a number from -1 to 1 (`scipy.stats.spearmanr`).
-
-    **Raises:** `ValueError` for unequal shapes, fewer than 3 values, and constant or non-finite
-    values.
-    """
-    left, right = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    paired = left.shape == right.shape and left.ndim == 1 and left.size >= 3
-    require(
-        paired,
-        "shapes of a, b",
-        (left.shape, right.shape),
-        "give two equally long rows of 3 or more",
-    )
-    for name, values in (("a", left), ("b", right)):
-        ranked = np.all(np.isfinite(values)) and np.ptp(values) > 0
-        require(ranked, name, values, "ranks need finite values that are not all equal")
-    return float(np.asarray(scipy.stats.spearmanr(left, right))[0])
-
-
-def normalised(
-    signal: Real[Array | np.ndarray, "*batch times"],
-    by: Reference = "mean",
-    *,
-    mvc: float | Real[Array | np.ndarray, ""] | None = None,
-) -> Float[Array, "*batch times"]:
-    """The signal over its mean, its largest absolute value, or the maximal voluntary contraction
-    (MVC).
-
-        shares = jm.spectra.normalised(5 + np.sin(np.arange(1000.0)), "maximum")
-
-    **Arguments:**
-
-    - `signal` [unit]: force or displacement, time along the last axis
-    - `by`: one of `"mean"`, `"maximum"`, `"mvc"`
-    - `mvc` [unit]: for `by="mvc"` only
-
-    **Returns:** the signal without unit, same shape and dtype; not finite where the reference is
-    zero.
-
-    **Raises:** `ValueError` for an unknown `by`, and an `mvc` that is missing, not positive, or not
-    needed.
-    """
-    signal = floating(signal)
-    require(by in get_args(Reference), "by", by, f"choose one of {', '.join(get_args(Reference))}")
-    remedy = f"by={by!r}; give mvc together with by='mvc', and only then"
-    require((mvc is not None) == (by == "mvc"), "mvc", mvc, remedy)
-    if by == "mean":
-        return signal / jnp.mean(signal, axis=-1, keepdims=True)
-    if by == "maximum":
-        return signal / jnp.max(jnp.abs(signal), axis=-1, keepdims=True)
-    positive = isinstance(mvc, jax.core.Tracer) or 0 < float(np.asarray(mvc)) < np.inf
-    require(positive, "mvc", mvc, "give the force at maximal voluntary contraction, above zero")
-    return signal / jnp.asarray(mvc, signal.dtype)
 
 
 class Peak(eqx.Module):
@@ -266,19 +201,12 @@ def peaks(spectrum: Spectrum, *, min_prominence: float = 0.01) -> Peaks:
             " peaks outside"
         )
     p = np.asarray(spectrum.proportional, dtype=float)
-    one = p.ndim == 1 and p.size >= 3
-    require(
-        one,
-        "spectrum.power shape",
-        p.shape,
-        "give one spectrum of 3 bins or more, as spectrum.mean()",
-    )
-    require(
-        np.all(np.isfinite(p)), "spectrum.power", spectrum.power, "give finite power, not all zero"
-    )
-    require(
-        0 <= min_prominence <= 1, "min_prominence", min_prominence, "give a fraction of the maximum"
-    )
+    remedy = "give one spectrum of 3 bins or more, as spectrum.mean()"
+    require(p.ndim == 1 and p.size >= 3, "spectrum.power shape", p.shape, remedy)
+    finite = np.all(np.isfinite(p))
+    require(finite, "spectrum.power", spectrum.power, "give finite power, not all zero")
+    share = 0 <= min_prominence <= 1
+    require(share, "min_prominence", min_prominence, "give a fraction of the maximum")
     indices, found = scipy.signal.find_peaks(p, prominence=min_prominence * p.max())
     pairs = zip(indices, found["prominences"], strict=True)
     top = int(np.argmax(p))
@@ -337,27 +265,28 @@ def _peak_frequency(
         seen = jnp.where((frequency >= low) & (frequency <= high), p, -jnp.inf)
         k = jnp.argmax(jax.lax.stop_gradient(seen))
         at = jnp.clip(k, 1, len(p) - 2) + jnp.arange(-1, 2)
-        f, three = frequency[at], p[at]
-        positive = three > 0
-        left, middle, right = jnp.log(jnp.where(positive, three, 1.0))
-        curvature = left - 2 * middle + right
-        top = (middle >= left) & (middle >= right) & (curvature < 0)
-        vertex = (at[1] == k) & jnp.all(positive) & top
-        away = (f[2] - f[0]) / 4 * (left - right) / jnp.where(vertex, curvature, -1.0)
-        return jnp.where(jnp.isnan(p[k]), jnp.nan, frequency[k] + jnp.where(vertex, away, 0.0))
+        away = jnp.where(at[1] == k, _vertex(frequency[at], p[at]), 0.0)
+        return jnp.where(jnp.isnan(p[k]), jnp.nan, frequency[k] + away)
 
     return jax.vmap(one)(power.reshape(-1, len(frequency))).reshape(power.shape[:-1])
+
+
+def _vertex(f: Any, power: Any) -> Any:
+    """How far from the middle one of three bins the parabola through their log powers has its
+    vertex; 0 where a neighbour is larger, or a power is 0."""
+    xp = np if isinstance(power, np.ndarray) else jnp
+    positive = power > 0
+    left, middle, right = xp.log(xp.where(positive, power, 1.0))
+    curvature = left - 2 * middle + right
+    top = (middle >= left) & (middle >= right) & (curvature < 0) & xp.all(positive)
+    # divided by another number where there is none: else the derivative would be NaN there
+    return xp.where(top, (f[2] - f[0]) / 4 * (left - right) / xp.where(top, curvature, -1.0), 0.0)
 
 
 def _peak(
     spectrum: Spectrum, p: Float[np.ndarray, " bins"], k: int | np.integer, prominence: float
 ) -> Peak:
-    f = np.asarray(spectrum.frequency, dtype=float)
-    interpolated = f[k]
-    if 0 < k < p.size - 1 and np.all(p[k - 1 : k + 2] > 0):
-        left, middle, right = np.log(p[k - 1 : k + 2])
-        curvature = left - 2 * middle + right
-        if curvature < 0:
-            interpolated += (f[k + 1] - f[k - 1]) / 4 * (left - right) / curvature
+    f, about = np.asarray(spectrum.frequency, dtype=float), slice(k - 1, k + 2)
+    away = _vertex(f[about], p[about]) if 0 < k < p.size - 1 else 0.0
     number = round(f[k] / spectrum.settings.resolution)
-    return Peak(number, float(f[k]), float(interpolated), float(p[k]), float(prominence))
+    return Peak(number, *map(float, (f[k], f[k] + away, p[k], prominence)))

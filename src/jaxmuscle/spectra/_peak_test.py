@@ -1,15 +1,14 @@
 """Does a spectrum have a peak in a band? A test against smooth spectra."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 from jaxtyping import Float, Int
 
 from jaxmuscle._common.arguments import require
 
-from ._bin_law import draw_powers, welch_law
+from ._bin_law import draw_powers, log_power_moments, welch_law
 from ._settings import SpectrumSettings
 
 DEGREE = 3  # of the polynomial in ln f that a smooth spectrum is, in the logarithm
@@ -20,6 +19,10 @@ MOST = 4  # peaks that are looked for
 LEFT = 0.05
 FINE = 4  # centres in a bin
 TURNS = 20  # by which the centre of a peak has come to rest
+
+
+Bins = Float[np.ndarray, " bins"]
+Terms = Float[np.ndarray, "bins terms"]
 
 
 class Peak(NamedTuple):
@@ -57,11 +60,11 @@ class _Family(NamedTuple):
     the largest statistic of smooth spectra, sorted.
     """
 
-    frequency: Float[np.ndarray, " bins"]
+    frequency: Bins
     bins: Int[np.ndarray, " bins"]
     whiten: Float[np.ndarray, "bins bins"]
-    bias: Float[np.ndarray, " bins"]
-    smooth: Float[np.ndarray, "bins terms"]
+    bias: Bins
+    smooth: Terms
     bells: Float[np.ndarray, "bins bells"]
     centre: Float[np.ndarray, " bells"]
     width: Float[np.ndarray, " bells"]
@@ -95,7 +98,7 @@ def bins_in(band: tuple[float, float], settings: SpectrumSettings) -> Int[np.nda
 
 
 def find_peaks(
-    power: Float[np.ndarray, " bins"],
+    power: Bins,
     settings: SpectrumSettings,
     segments: tuple[int, ...],
     band: tuple[float, float],
@@ -125,43 +128,46 @@ def find_peaks(
     **Raises:** `ValueError` for a band that is not covered by bins, and for power that is not
     positive.
     """
-    power = np.asarray(power, float)
-    require(bool(np.all(power > 0)), "power", power, "give positive power")
-    family = _build_family(settings, tuple(segments), (float(band[0]), float(band[1])))
-    logged = np.log(power[family.bins - settings.first_bin]) - family.bias
+    require(bool(np.all(np.asarray(power) > 0)), "power", power, "give positive power")
+    family, logged = _log_powers(power, settings, segments, band)
     whole, known, found, ps = family, family.smooth, list[Peak](), list[float]()
     for _ in range(MOST):
         statistic, place, _ = _find_clearest(family, known, logged[None])
+        at, width = family.centre[place[0]], family.width[place[0]]
         beyond = len(family.null) - np.searchsorted(family.null, statistic[0])
         ps.append((1 + int(beyond)) / (1 + len(family.null)))
-        if ps[-1] > level:
-            break
-        at, width = family.centre[place[0]], family.width[place[0]]
-        found.append(Peak(*_measure(family, known, logged, int(place[0])), float(width), ps[-1]))
-        known = np.column_stack([known, family.bells[:, place[0]]])
         # A hill is no exact bell: what is left of its flanks is no peak of its own.
         apart = np.abs(family.centre - at) > np.maximum(width, family.width)
+        if ps[-1] > level:
+            break
+        found.append(Peak(*_measure(family, known, logged, place[0]), float(width), ps[-1]))
+        known = np.column_stack([known, family.bells[:, place[0]]])
+        if not np.any(apart):
+            break
         family = family._replace(
             bells=family.bells[:, apart], centre=family.centre[apart], width=family.width[apart]
         )
-        if not np.any(apart):
-            break
     threshold = float(np.quantile(family.null, 1 - level))
     return PeakTest(ps[0], tuple(found), _detectable_power(whole, known, logged, threshold))
 
 
 def measure_peak(
-    power: Float[np.ndarray, " bins"],
-    settings: SpectrumSettings,
-    segments: tuple[int, ...],
-    band: tuple[float, float],
+    power: Any, settings: SpectrumSettings, segments: tuple[int, ...], band: tuple[float, float]
 ) -> tuple[float, float]:
     """Frequency [Hz] and power of the clearest peak of the band, whether or not it is
     significant."""
-    family = _build_family(settings, tuple(segments), (float(band[0]), float(band[1])))
-    logged = np.log(np.asarray(power, float)[family.bins - settings.first_bin]) - family.bias
+    family, logged = _log_powers(power, settings, segments, band)
     _, place, _ = _find_clearest(family, family.smooth, logged[None])
-    return _measure(family, family.smooth, logged, int(place[0]))
+    return _measure(family, family.smooth, logged, place[0])
+
+
+def _log_powers(
+    power: Any, settings: SpectrumSettings, segments: tuple[int, ...], band: tuple[float, float]
+) -> tuple[_Family, Bins]:
+    """The log powers of the bins about a band, without their bias, and what is known of them."""
+    family = _build_family(settings, tuple(segments), (float(band[0]), float(band[1])))
+    at = family.bins - settings.first_bin
+    return family, np.log(np.asarray(power, float)[at]) - family.bias
 
 
 @functools.lru_cache(maxsize=64)
@@ -173,8 +179,8 @@ def _build_family(
     require(len(bins) > 0, "band", band, remedy)
     frequency = bins * settings.resolution
     law = welch_law(settings, bins, segments)
-    half = law.degrees / 2
-    sd = np.sqrt(scipy.special.polygamma(1, half))
+    bias, variance = log_power_moments(law.degrees)
+    sd = np.sqrt(variance)
     whiten = np.linalg.inv(np.linalg.cholesky(sd[:, None] * law.correlation * sd))
     x = np.log(frequency)
     smooth = np.polynomial.legendre.legvander(2 * (x - x[0]) / (x[-1] - x[0]) - 1, DEGREE)
@@ -182,7 +188,6 @@ def _build_family(
     centres = np.arange(band[0], top + 1e-9, settings.resolution / FINE)
     centre, width = np.repeat(centres, len(WIDTHS)), np.tile(WIDTHS, len(centres))
     bells = np.exp(-4 * np.log(2) * ((frequency[:, None] - centre) / width) ** 2)
-    bias = scipy.special.digamma(half) - np.log(half)
     family = _Family(frequency, bins, whiten, bias, smooth, bells, centre, width, np.empty(0))
     drawn = draw_powers(law, DRAWS, np.random.default_rng(0))
     statistic, _, _ = _find_clearest(family, smooth, np.log(drawn) - bias)
@@ -190,7 +195,7 @@ def _build_family(
 
 
 def _find_clearest(
-    family: _Family, known: Float[np.ndarray, "bins terms"], logged: Float[np.ndarray, "rows bins"]
+    family: _Family, known: Terms, logged: Float[np.ndarray, "rows bins"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of every row the largest statistic and the place of its bell; and what the known terms
     leave of every bell."""
@@ -210,17 +215,15 @@ def _find_clearest(
     return statistic[np.arange(len(place)), place], place, np.where(seen, left, 0.0)
 
 
-def _fit_terms(
-    family: _Family, columns: Float[np.ndarray, "bins terms"], logged: Float[np.ndarray, " bins"]
-) -> Float[np.ndarray, " terms"]:
+def _fit_terms(family: _Family, columns: Terms, logged: Bins) -> Float[np.ndarray, " terms"]:
     return np.linalg.lstsq(family.whiten @ columns, family.whiten @ logged, rcond=None)[0]
 
 
 def _measure(
     family: _Family,
-    known: Float[np.ndarray, "bins terms"],
-    logged: Float[np.ndarray, " bins"],
-    place: int,
+    known: Terms,
+    logged: Bins,
+    place: int | np.integer,
 ) -> tuple[float, float]:
     """Where the power above the smooth spectrum has its centre, within the bell about that centre;
     and that power.
@@ -242,8 +245,8 @@ def _measure(
 
 def _detectable_power(
     family: _Family,
-    known: Float[np.ndarray, "bins terms"],
-    logged: Float[np.ndarray, " bins"],
+    known: Terms,
+    logged: Bins,
     threshold: float,
 ) -> float:
     """The power that a bell in the middle of the band, 1.8 Hz wide, adds to the smooth spectrum,

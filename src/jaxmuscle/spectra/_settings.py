@@ -1,11 +1,9 @@
 """How a spectrum is estimated, and the window that is analysed."""
 
 import dataclasses
-import difflib
 import functools
 import math
-import numbers
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -13,7 +11,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxmuscle._common.arguments import require
+from jaxmuscle._common.arguments import count, is_real, require
 from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.documents import converted
 from jaxmuscle._common.text import choices
@@ -90,62 +88,27 @@ class SpectrumSettings(Spelled, eqx.Module):
     tapers: int = eqx.field(static=True, default=1, converter=_python)
 
     def __check_init__(self):
-        def check(name: str, kind: type, valid: Callable[[Any], bool], remedy: str) -> None:
-            value = getattr(self, name)
-            require(
-                isinstance(value, kind) and not isinstance(value, bool) and valid(value),
-                name,
-                value,
-                remedy,
-            )
-
-        half = self.length // 2 if isinstance(self.length, int) else 0
-        check(
-            "rate",
-            numbers.Real,
-            lambda f: 0 < f <= FASTEST,
-            f"give a sampling rate above 0 Hz, at most {FASTEST:g} Hz",
-        )
-        check(
-            "length",
-            int,
-            lambda n: 8 <= n <= LENGTH,
-            f"give a whole number of samples, 8 to {LENGTH}",
-        )
-        check(
-            "last_bin", int, lambda k: 1 <= k <= half, f"give a bin from 1 to length // 2 = {half}"
-        )
-        below = f"give a bin from 0 (the mean) to last_bin = {self.last_bin}"
-        check("first_bin", int, lambda k: 0 <= k <= self.last_bin, below)
-        check(
-            "overlap",
-            numbers.Real,
-            lambda x: 0 <= x < 1,
-            "give a fraction of a segment, 0 to below 1",
-        )
-        check(
-            "filter_order", int, lambda n: 1 <= n <= ORDER, f"give a whole number from 1 to {ORDER}"
-        )
-        if self.filter_cutoff is not None:
-            inside = (
-                f"give a frequency from 0 to rate / 2 = {self.rate / 2:g} Hz, or None for no filter"
-            )
-            check("filter_cutoff", numbers.Real, lambda f: 0 < f < self.rate / 2, inside)
+        rate, overlap, cutoff, tapers = self.rate, self.overlap, self.filter_cutoff, self.tapers
+        remedy = f"give a sampling rate above 0 Hz, at most {FASTEST:g} Hz"
+        require(is_real(rate) and 0 < rate <= FASTEST, "rate", rate, remedy)
+        count("length", self.length, 8, LENGTH)
+        count("last_bin", self.last_bin, 1, self.length // 2)
+        count("first_bin", self.first_bin, 0, self.last_bin)
+        remedy = "give a fraction of a segment, 0 to below 1"
+        require(is_real(overlap) and 0 <= overlap < 1, "overlap", overlap, remedy)
+        count("filter_order", self.filter_order, 1, ORDER)
+        if cutoff is not None:
+            remedy = f"give a frequency from 0 to rate / 2 = {rate / 2:g} Hz, or None for no filter"
+            require(is_real(cutoff) and 0 < cutoff < rate / 2, "filter_cutoff", cutoff, remedy)
         for name, choice in _CHOICES.items():
-            known = get_args(choice)
-            check(name, str, known.__contains__, f"choose one of {', '.join(known)}")
-        slepian = self.window == "dpss"
-        remedy = (
-            f"give at least 2, at most length / 8 = {self.length // 8}"
-            if slepian
-            else "give 1, or window='dpss'"
-        )
-        check(
-            "tapers",
-            int,
-            lambda n: 2 <= n <= max(self.length // 8, 2) if slepian else n == 1,
-            remedy,
-        )
+            value, known = getattr(self, name), get_args(choice)
+            require(value in known, name, value, f"choose one of {', '.join(known)}")
+        if self.window == "dpss":
+            count("tapers", tapers, 2, max(self.length // 8, 2))
+        else:
+            require(
+                type(tapers) is int and tapers == 1, "tapers", tapers, "give 1, or window='dpss'"
+            )
 
     @classmethod
     def named(cls, name: str) -> "SpectrumSettings":
@@ -161,9 +124,8 @@ class SpectrumSettings(Spelled, eqx.Module):
         **Raises:** `ValueError` for another name. **Source:** Thomson 1982,
         doi:10.1109/PROC.1982.12433 (multitaper).
         """  # noqa: E501 (a row of a table is one line)
-        require(
-            isinstance(name, str) and name in NAMED, "settings", name, choices(str(name), NAMED)
-        )
+        known = isinstance(name, str) and name in NAMED
+        require(known, "settings", name, choices(str(name), NAMED))
         return cls(**NAMED[name])
 
     @classmethod
@@ -222,67 +184,40 @@ class SpectrumSettings(Spelled, eqx.Module):
         **Raises:** `ValueError` unless K >= 1. **Source:** Welch 1967,
         doi:10.1109/TAU.1967.1161901.
         """
-        require(
-            segments >= 1, "segments", segments, "give the number of averaged segments, at least 1"
-        )
+        remedy = "give the number of averaged segments, at least 1"
+        require(segments >= 1, "segments", segments, remedy)
         w, n, step = tapers_of(self, self.length), self.length, self.step
         lags = range(min(segments - 1, (n - 1) // step) + 1)
         squares = [float(np.sum((w[:, : n - j * step] @ w[:, j * step :].T) ** 2)) for j in lags]
-        return (
-            2 * segments / (squares[0] + 2 * sum((1 - j / segments) * squares[j] for j in lags[1:]))
-        )
+        beside = sum((1 - j / segments) * squares[j] for j in lags[1:])
+        return 2 * segments / (squares[0] + 2 * beside)
 
-    def to_dict(self, *, whole: bool = False) -> dict[str, Any]:
-        """The fields as TOML and JSON hold them; no cut-off is `"none"`, as TOML has no null.
-
-        A single taper is left out, unless the table is to be `whole`.
-        """
-        fields = [
-            field.name
-            for field in dataclasses.fields(self)
-            if field.name != "tapers" or self.tapers > 1 or whole
-        ]
-        values = {name: getattr(self, name) for name in fields}
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as TOML and JSON hold them; no cut-off is `"none"`, as TOML has no null."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return values | ({"filter_cutoff": "none"} if self.filter_cutoff is None else {})
 
     @classmethod
-    def names(cls, *, whole: bool = True) -> tuple[str, ...]:
-        """Names of all settings; without `whole` all but `tapers`, which a table may lack (it is
-        then a single one)."""
-        return tuple(
-            field.name for field in dataclasses.fields(cls) if whole or field.name != "tapers"
-        )
-
-    @classmethod
-    def from_dict(
-        cls, values: Mapping[str, Any], *, needed: Iterable[str] = ()
-    ) -> "SpectrumSettings":
+    def from_dict(cls, values: Mapping[str, Any], *, whole: bool = False) -> "SpectrumSettings":
         """Settings from a table as `to_dict` writes it; what it does not name keeps its default,
-        unless it is `needed`.
+        unless the table has to be `whole`.
 
         **Raises:** `ValueError` for an unknown name, with the nearest known one, for one missing,
         and for an invalid value.
         """
-        known = [field.name for field in dataclasses.fields(cls)]
-        for name in needed:
+        kinds: dict[str, Any] = {field.name: field.type for field in dataclasses.fields(cls)}
+        for name in kinds if whole else ():
             if name not in values:
                 raise ValueError(
                     f"has no key {name!r}: give it; a setting that is not there gets no default"
                 )
-        for name, value in values.items():
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
-            remedy = (
-                f"no such spectrum setting, did you mean {near!r}? Known are {', '.join(known)}"
-            )
-            require(name in known, name, value, remedy)
-        given = {
-            **values,
-            **({"filter_cutoff": None} if values.get("filter_cutoff") == "none" else {}),
-        }
-        for field in dataclasses.fields(cls):
-            if field.name in given:  # ranges are checked by the constructor
-                kind: Any = field.type
-                converted(_python(given[field.name]), kind, field.name)
+        given = dict(values)
+        if given.get("filter_cutoff") == "none":
+            given["filter_cutoff"] = None
+        for name, value in given.items():  # ranges are checked by the constructor
+            remedy = f"no such spectrum setting; {choices(name, kinds)}"
+            require(name in kinds, name, value, remedy)
+            converted(_python(value), kinds[name], name)
         return cls(**given)
 
     def replace(self, **changes: Any) -> "SpectrumSettings":

@@ -32,43 +32,19 @@ class Spectrum(Shown, eqx.Module):
     unit: str = eqx.field(static=True, default="N")
 
     def _card(self) -> Card:
-        known = (
-            isinstance(x, jax.Array | np.ndarray) and is_concrete(x)
-            for x in (self.frequency, self.power)
-        )
-        if not all(known) or self.frequency.shape[-1:] != self.power.shape[-1:]:
+        if not all(map(is_known, (self.frequency, self.power))) or (
+            self.frequency.shape[-1:] != self.power.shape[-1:]
+        ):
             return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
-        frequency, power, apart = (
-            np.asarray(self.bins),
-            np.asarray(self.power, float),
-            self.settings.resolution,
-        )
-        rows = [
-            (
-                "bins",
-                (
-                    f"{frequency.size}, {frequency[0]:.3g} to {frequency[-1]:.3g} Hz, {apart:.3g}"
-                    " Hz apart"
-                ),
-            )
-        ]
+        f, power, apart = np.asarray(self.bins), np.asarray(self.power), self.settings.resolution
+        rows = [("bins", f"{f.size}, {f[0]:.3g} to {f[-1]:.3g} Hz, {apart:.3g} Hz apart")]
         if power.ndim > 1:
             rows.append(("spectra", f"{' x '.join(map(str, power.shape[:-1]))}; below, their mean"))
             power = power.mean(axis=tuple(range(power.ndim - 1)))
-        largest, square = (
-            int(np.argmax(power)),
-            f"({self.unit})^2" if "/" in self.unit else f"{self.unit}^2",
-        )
+        square = f"({self.unit})^2" if "/" in self.unit else f"{self.unit}^2"
+        top, share = f[np.argmax(power)], 100 * power.max() / power.sum()
         rows.append(("variance", f"{power.sum() * apart:.4g} {square} in these bins"))
-        rows.append(
-            (
-                "largest",
-                (
-                    f"bin at {frequency[largest]:.3g} Hz, {100 * power[largest] / power.sum():.3g}"
-                    " % of the power"
-                ),
-            )
-        )
+        rows.append(("largest", f"bin at {top:.3g} Hz, {share:.3g} % of the power"))
         return facts(f"power spectral density [{square}/Hz]", rows)
 
     @property
@@ -100,18 +76,23 @@ class Spectrum(Shown, eqx.Module):
         return plot.spectrum(self, ax, log=log, proportional=proportional, label=label)
 
 
-def floating(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch times"]:
+Samples = Real[Array | np.ndarray, "*batch times"]
+Signals = Float[Array, "*batch times"]
+
+
+def is_known(x: Any) -> bool:
+    """Whether it is an array with values, and not something that JAX traces or took its place."""
+    return isinstance(x, jax.Array | np.ndarray) and is_concrete(x)
+
+
+def floating(signal: Samples) -> Signals:
     """The signal as an array of its own floating dtype; whole numbers get the default one."""
     signal = jnp.asarray(signal)
     samples = signal.ndim >= 1 and signal.shape[-1] >= 1 and not jnp.iscomplexobj(signal)
-    require(
-        samples, "signal", jax.typeof(signal), "give real samples along the last axis, at least one"
-    )
-    return (
-        signal
-        if jnp.issubdtype(signal.dtype, jnp.floating)
-        else signal.astype(jnp.result_type(float))
-    )
+    remedy = "give real samples along the last axis, at least one"
+    require(samples, "signal", jax.typeof(signal), remedy)
+    known = jnp.issubdtype(signal.dtype, jnp.floating)
+    return signal if known else signal.astype(float)
 
 
 def _impulse_response(
@@ -126,9 +107,7 @@ def _along(values: np.ndarray, of: Array) -> Array:
     return jnp.asarray(values, of.dtype).reshape((1,) * (of.ndim - values.ndim) + values.shape)
 
 
-def _convolve(
-    signal: Float[Array, "*batch times"], response: Float[np.ndarray, " times"]
-) -> Float[Array, "*batch times"]:
+def _convolve(signal: Signals, response: Float[np.ndarray, " times"]) -> Signals:
     """y_n = Σ_m h_m x_{n - m}, for as many samples as both have."""
     samples = signal.shape[-1]
     size = scipy.fft.next_fast_len(2 * samples - 1, real=True)
@@ -162,9 +141,7 @@ def lowpass(
 
 
 @kept
-def _lowpass(
-    signal: Real[Array | np.ndarray, "*batch times"], settings: SpectrumSettings
-) -> Float[Array, "*batch times"]:
+def _lowpass(signal: Samples, settings: SpectrumSettings) -> Signals:
     signal, sections = floating(signal), settings.sections
     assert sections is not None
     if settings.filter_direction == "both":
@@ -178,9 +155,7 @@ def _lowpass(
     )
 
 
-def _forward_and_backward(
-    x: Float[Array, "*batch times"], sections: Float[np.ndarray, "sections 6"]
-) -> Float[Array, "*batch times"]:
+def _forward_and_backward(x: Signals, sections: Float[np.ndarray, "sections 6"]) -> Signals:
     first_order = min(np.sum(sections[:, 2] == 0), np.sum(sections[:, 5] == 0))
     edge = 3 * (2 * len(sections) + 1 - int(first_order))
     remedy = (

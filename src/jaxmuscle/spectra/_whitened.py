@@ -17,12 +17,12 @@ SMOOTH, ABOUT, LINE = 3.0, 2.0, 0.5
 PADDED = 4  # times the samples, so that no line lies between two frequencies
 LOWEST = 1.5  # Hz, from which on lines are looked for: below, a slow wander looks like one
 
-Density = Callable[[Float[np.ndarray, " frequencies"]], Float[np.ndarray, " frequencies"]]
+Frequencies = Float[np.ndarray, " frequencies"]
+Density = Callable[[Frequencies], Frequencies]
+Records = Float[np.ndarray, "records times"]
 
 
-def whiten(
-    signals: Float[np.ndarray, "records times"], rate: float, density: Density
-) -> Float[np.ndarray, "records times"]:
+def whiten(signals: Records, rate: float, density: Density) -> Records:
     """Records between 0.5 and 12 Hz over the root of a smooth spectrum, each of unit variance.
 
         w = FT⁻¹[X(f) / √(S(f) m(f))],    m = mean over ± 1.5 Hz of |X|² / S
@@ -45,9 +45,7 @@ def whiten(
     return w / np.std(w, axis=-1, keepdims=True)
 
 
-def envelope_power(
-    w: Float[np.ndarray, "records times"], rate: float
-) -> Float[np.ndarray, " records"]:
+def envelope_power(w: Records, rate: float) -> Float[np.ndarray, " records"]:
     """How much the size of whitened records changes slowly: the mean of |FT(w² - 1)|² / n over the
     frequencies 0 < f <= 1 Hz.
 
@@ -66,7 +64,7 @@ def envelope_power(
     return np.mean(np.abs(np.fft.rfft(w**2 - 1)[..., 1 : last + 1]) ** 2, axis=-1) / n
 
 
-def log_powers(w: Float[np.ndarray, "records times"]) -> Float[np.ndarray, "records parts"]:
+def log_powers(w: Records) -> Float[np.ndarray, "records parts"]:
     """The logarithms of the power of eight parts of whitened records, less their mean."""
     parts = np.array_split(w**2, PARTS, axis=-1)
     power = np.log(np.stack([np.mean(part, axis=-1) for part in parts], axis=-1))
