@@ -46,9 +46,11 @@ def main() -> None:
     """Print the figures asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("words", help="part of the figures' names", nargs="?", default="")
-    words = parser.parse_args().words
+    words: str = parser.parse_args().words
     table = pd.read_csv(HISTORY, keep_default_na=False)
     table = table[table["figure"].str.contains(words, regex=False)]
+    if table.empty:
+        parser.error(f'no figure has "{words}" in its name; without words, all are shown')
     for (figure, unit, machine), runs in table.groupby(["figure", "unit", "machine"], sort=False):
         moved = runs.assign(over_first=(runs["value"] / runs["value"].iloc[0]).round(3))
         shown = moved[["date", "commit", "load", "value", "over_first"]]
