@@ -61,7 +61,7 @@ docs: .venv/.stamp-docs
 	$(BIN)/python docs/generate.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-hooks: .venv/.stamp-maintain
+hooks: .venv/.stamp-test .venv/.stamp-maintain
 	$(BIN)/pre-commit install
 
 # One version of each library for all Pythons, as the newest Pythons are not tested so often.
