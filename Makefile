@@ -3,9 +3,10 @@ PYTHON ?= python3
 BIN = .venv/bin
 # Two workers, whatever the machine: each compiles a lot and takes up to 7 GiB.
 PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
-PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
+# With the versions that were tested together.
+PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install --constraint constraints.txt
 
-.PHONY: help install fit notebooks test test-all test-minimum mutants bench docs clean
+.PHONY: help install fit notebooks test test-all test-minimum mutants bench docs hooks pins dist clean
 
 help:
 	@echo "make fit        fit a bundled measured target; writes report and figure to out/fit"
@@ -16,8 +17,11 @@ help:
 	@echo "make test-all   for developers, before a release: also pages, notebooks, gallery, kills, damaged files, long studies"
 	@echo "make test-minimum  some tests with the oldest versions that pyproject.toml allows, in .venv-minimum"
 	@echo "make mutants    random faults in the package: which of them a test notices; out/mutants.json"
-	@echo "make bench      measure speed; writes out/bench.json"
+	@echo "make bench      measure speed; writes out/bench.json, appends to benchmarks/history.csv"
 	@echo "make docs       write the documentation; open site/index.html"
+	@echo "make hooks      from now on, every git commit runs the checks of make test first (not the tests)"
+	@echo "make pins       renew the versions in constraints.txt, which make installs"
+	@echo "make dist       build sdist and wheel into dist, and check them"
 	@echo "make clean      remove caches and what make itself wrote, but not .venv, .venv-minimum and other results in out/"
 	@echo "Another interpreter: make PYTHON=python3.12 fit"
 
@@ -51,17 +55,30 @@ mutants: .venv/.stamp-test
 	$(BIN)/python tests/mutants.py
 
 bench: .venv/.stamp-bench
-	$(BIN)/python benchmarks/run.py --out out/bench.json
+	$(BIN)/python benchmarks/run.py --out out/bench.json --history
 
 docs: .venv/.stamp-docs
 	$(BIN)/python docs/generate.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
+hooks: .venv/.stamp-test .venv/.stamp-maintain
+	$(BIN)/pre-commit install
+
+# One version of each library for all Pythons, as the newest Pythons are not tested so often.
+pins: .venv/.stamp-maintain
+	$(BIN)/uv pip compile --quiet --upgrade --universal --fork-strategy fewest --python-version 3.11 --all-extras --group dev \
+	  --no-annotate --custom-compile-command "make pins" --output-file constraints.txt pyproject.toml >/dev/null
+
+dist: .venv/.stamp-maintain
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation
+	$(BIN)/twine check --strict dist/*
+
 clean:
-	rm -rf out/fit out/bench.json out/mutants.json site dist build .test-out .pytest_cache .ruff_cache .hypothesis
+	rm -rf out/fit out/bench.json out/mutants.json site dist build .test-out .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -path './.venv*' -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +
 
-.venv/.stamp-run: pyproject.toml
+.venv/.stamp-run: pyproject.toml constraints.txt
 	@command -v $(PYTHON) >/dev/null || \
 	  { echo "error: $(PYTHON) not found; name a Python >= 3.11: make PYTHON=/path/to/python" >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -92,6 +109,11 @@ clean:
 .venv/.stamp-docs: .venv/.stamp-run
 	@echo "Installing the documentation tools into .venv"
 	@$(PIP) --group docs
+	@touch $@
+
+.venv/.stamp-maintain: .venv/.stamp-run
+	@echo "Installing the tools of maintainers into .venv"
+	@$(PIP) --group maintain
 	@touch $@
 
 .venv-minimum/.stamp: pyproject.toml

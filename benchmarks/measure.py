@@ -35,6 +35,11 @@ class Row:
             return None
         return self.value <= self.target if self.at_most else self.value >= self.target
 
+    @property
+    def figure(self) -> str:
+        """The name, with what it is compared to."""
+        return self.name if self.ratio_to is None else f"{self.name} of {self.ratio_to}"
+
     def as_dict(self) -> dict[str, Any]:
         """The row as the JSON file holds it."""
         return dataclasses.asdict(self) | {"met": self.met}

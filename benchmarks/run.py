@@ -13,6 +13,7 @@ from typing import Any
 
 import alternative
 import fits
+import history
 import integration
 import jax
 import linear
@@ -93,6 +94,9 @@ def main() -> int:
         metavar="SECTION",
         help=f"some of {', '.join(SECTIONS)} (default: all)",
     )
+    parser.add_argument(
+        "--history", action="store_true", help="append what was measured to benchmarks/history.csv"
+    )
     options = parser.parse_args()
     jax.config.update("jax_enable_compilation_cache", False)
     os.environ["JAXMUSCLE_CACHE"] = "off"  # what is measured here is compiled here
@@ -112,6 +116,8 @@ def main() -> int:
     write(
         options.out, {"machine": facts, "unequal": unequal, "rows": [row.as_dict() for row in rows]}
     )
+    if options.history:
+        history.append(facts, rows)
     _conclude(rows, unequal, facts)
     return 1 if unequal else 0
 

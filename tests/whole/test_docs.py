@@ -228,12 +228,6 @@ def test_every_formula_of_a_page_can_be_typeset():
     )
 
 
-def test_the_citation_names_the_current_version():
-    about = (PACKAGE / "__about__.py").read_text(encoding="utf-8")
-    (version,) = re.findall(r'^__version__ = "(.+)"$', about, re.MULTILINE)
-    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-
-
 def test_parameter_page_is_current():
     generate = module(ROOT / "docs" / "generate.py")
     assert generate.PAGE.read_text(encoding="utf-8") == generate.page(), (
