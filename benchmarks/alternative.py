@@ -34,7 +34,7 @@ SEEDS, RATE, ROUNDS, DOUBT = 48, 100.0, 3, 0.01
 # the default 1e-8 creeps along the ripples that fixed seeds leave in the cost, to the last
 # evaluation allowed
 FTOL = 1e-4
-DEFAULTS = {name: parameter.default for name, parameter in jm.PARAMETERS.items()}
+DEFAULTS = {name: parameter.default for name, parameter in jm.model.PARAMETERS.items()}
 OURS, OTHER = "jaxmuscle", "scipy and numba"
 
 

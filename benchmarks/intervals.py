@@ -4,10 +4,10 @@ NumPy from a known spectrum, without the model.
     python benchmarks/intervals.py steadiness [--count N]
     python benchmarks/intervals.py tremor [--count N]
 
-`steadiness` looks at the intervals of `jm.steadiness`. The spectrum relaxes from a corner of 0.5, 1
-or 2 Hz on, and has a floor; half of the recordings have a tremor at 9 Hz. Others have a level that
-wanders: 1/f^1.5, with periods up to eight recordings long. Takes ten minutes; the outcome stands in
-docs/recordings.md.
+`steadiness` looks at the intervals of `jm.data.steadiness`. The spectrum relaxes from a corner of
+0.5, 1 or 2 Hz on, and has a floor; half of the recordings have a tremor at 9 Hz. Others have a
+level that wanders: 1/f^1.5, with periods up to eight recordings long. Takes ten minutes; the
+outcome stands in docs/recordings.md.
 
 `tremor` looks at the test for a tremor: 1/f with a bend at 1, 1.8 or 4 Hz, a floor, an amplitude
 that swells and fades in half of the recordings, and a hill between 8 and 10.5 Hz. Takes a few
@@ -109,7 +109,7 @@ def count_held(signals: np.ndarray, tremor: bool, held: Counts) -> None:
     """Adds whether the interval, and value ± 1.96 errors, of every measure of every group of trials
     hold the truth."""
     recordings = [jm.Recording(x, RATE) for x in signals]
-    each = [jm.steadiness(recording) for recording in recordings]
+    each = [jm.data.steadiness(recording) for recording in recordings]
     truth = {name: np.mean([one[name].value for one in each]) for name in each[0].measures} | {
         "mean": MEAN
     }
@@ -117,7 +117,7 @@ def count_held(signals: np.ndarray, tremor: bool, held: Counts) -> None:
     truth["tremor_size"] = math.nan  # `tremor` below looks at it
     for trials in TRIALS:
         for i in range(0, len(recordings) - trials + 1, trials):
-            found = each[i] if trials == 1 else jm.steadiness(recordings[i : i + trials])
+            found = each[i] if trials == 1 else jm.data.steadiness(recordings[i : i + trials])
             for name, m in found.measures.items():
                 if m.stderr is not None and m.interval is not None and np.isfinite(truth[name]):
                     low, high = m.interval
@@ -164,7 +164,7 @@ def tremor(count: int) -> None:
             rng, held, found = np.random.default_rng(7), [], 0
             for i in range(count):
                 made, at, size = trembling(rng, seconds, trials, share, i % 6)
-                one = jm.steadiness(made)
+                one = jm.data.steadiness(made)
                 if (frequency := one["tremor_frequency"]).interval is not None:
                     found += 1
                     ends = frequency.interval, one["tremor_size"].interval

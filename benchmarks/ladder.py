@@ -52,7 +52,7 @@ def with_shares(task: jm.Isometric, shares: dict[str, float]) -> jm.Isometric:
 
 def truth(rung: int) -> jm.Isometric:
     """The default muscle, its floor lower, on a rung."""
-    task = jm.on_rung(QUIET, rung)
+    task = jm.model.on_rung(QUIET, rung)
     if rung:
         task = task.replace(activation_time=TWITCH)
     with jax.enable_x64(True):

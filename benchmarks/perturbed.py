@@ -326,7 +326,7 @@ def people(count: int) -> None:
         muscle = TASK.replace(
             **{name: factor * float(TASK[name]) for name in ("k_w", "k_z", "c_w", "c_z")}
         )
-        shaking = jm.on_rung(muscle, 2).replace(**TREMOR)
+        shaking = jm.model.on_rung(muscle, 2).replace(**TREMOR)
         runs = {
             "noise alone": recorded(muscle, np.random.default_rng(14), count),
             "tremor": _simulated(shaking, count),
@@ -356,7 +356,7 @@ def _held(fits: list[jm.fits.FitResult], true: dict[str, float]) -> None:
 
 def _simulated(
     muscle: jm.PrescribedLength, count: int, lines: np.ndarray = np.r_[30:300]
-) -> list[jm.PerturbedRecording]:
+) -> list[jm.data.PerturbedRecording]:
     """A minute of the muscle moved at these lines [1/60 Hz], 1 mm rms, by the package's own
     simulation."""
     rng, rate, runs = np.random.default_rng(13), 100, []
@@ -367,7 +367,7 @@ def _simulated(
         length *= 1e-3 / np.std(length)
         moved = jm.settled(muscle).with_parts(x_z=jm.model.Sampled.through(time, -length))
         force = np.asarray(jm.simulate(moved, seed, duration=90.0, rate=float(rate)).output)
-        runs.append(jm.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0)))
+        runs.append(jm.data.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0)))
     return runs
 
 
@@ -408,7 +408,7 @@ def richer(count: int) -> None:
         "noise_K_w": 0.27,
         "noise_K_z": 0.0013,
     }
-    muscle = jm.on_rung(TASK, 2).replace(**true, **TREMOR)
+    muscle = jm.model.on_rung(TASK, 2).replace(**true, **TREMOR)
     bands = {"two bands": np.r_[28:36, 170:200], "even": np.r_[30:300]}
     for words, lines in bands.items():
         runs = _simulated(muscle, count, lines)
@@ -452,7 +452,7 @@ def linear(count: int) -> None:
             )
             own += tremor * shaped(rng, 1 / np.hypot(f**2 - 8.5**2, 0.8 * f))
             force = 20.0 + own + np.fft.irfft(np.fft.rfft(x) * answer, length)
-            record = jm.PerturbedRecording.from_array(
+            record = jm.data.PerturbedRecording.from_array(
                 force, x, rate, positive="lengthening"
             ).steady((3.0, 63.0))
             fits.append(jm.fit(TASK, record, seeds=0, check_seeds=0))

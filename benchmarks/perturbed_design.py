@@ -73,7 +73,7 @@ def main():
     )
     with jax.enable_x64(True):
         for quantity, name in zip(("K_w0", "K_z0", "C_w0", "C_z0"), COEFFICIENTS, strict=True):
-            made = jm.design_input(result, quantity)
+            made = jm.uncertainty.design_input(result, quantity)
             i = COEFFICIENTS.index(name)
             known = beside(result, made)
             sd = [

@@ -87,7 +87,7 @@ def recorded(
     reflex: Callable[[np.ndarray], np.ndarray] | None = None,
     mass: float = 0.0,
     line: float = 0.0,
-) -> list[jm.PerturbedRecording]:
+) -> list[jm.data.PerturbedRecording]:
     """Recordings of the muscle with noise on its stiffnesses; `reflex`, drive over lengthening;
     `mass` of a rig; `line`, of which relative amplitude a sine of 4.25 Hz is in both."""
     sines = Sines(rng, seconds + 2 * MARGIN, rows)
@@ -109,7 +109,7 @@ def recorded(
     pull = (force(task, x, v, a, drive, *noise) - mass * a[::2])[::EVERY]
     window = (MARGIN, MARGIN + seconds)
     return [
-        jm.PerturbedRecording.from_array(
+        jm.data.PerturbedRecording.from_array(
             pull[:, row],
             -x[:: 2 * EVERY, row],
             0.5 / DT / EVERY,

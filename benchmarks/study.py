@@ -41,7 +41,7 @@ DRAWN = 200  # people that stand for the whole population, the same deviates in 
 def centre() -> jm.Isometric:
     with jax.enable_x64(True):
         return with_shares(
-            jm.on_rung(QUIET, 2).replace(activation_time=TWITCH), {"resonance": SHARE}
+            jm.model.on_rung(QUIET, 2).replace(activation_time=TWITCH), {"resonance": SHARE}
         )
 
 
@@ -70,7 +70,7 @@ def population(
 def recorded(tasks: dict[str, jm.Isometric], trials: int, key: int, folder: Path) -> Path:
     """The files of a study and its table."""
     rows = ["file,person,group,trial"]
-    sweep = jm.Sweep.of([jm.settled(task) for task in tasks.values()])
+    sweep = jm.ensembles.Sweep.of([jm.settled(task) for task in tasks.values()])
     for number, (name, task) in enumerate(zip(tasks, sweep, strict=True)):
         runs = jm.ensemble(
             task,

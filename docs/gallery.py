@@ -72,7 +72,7 @@ result = jm.fit(jm.task_for(target), target)
 SIMULATED = """
 runs = jm.ensemble(result.task, key, seeds=200)
 summary = jm.ensemble(result.task, key, seeds=2000, reduce=True)
-sweep = jm.Sweep.grid(result.task, c_w=[50.0, 100.0, 200.0])
+sweep = jm.ensembles.Sweep.grid(result.task, c_w=[50.0, 100.0, 200.0])
 ax = None
 for task, run in zip(sweep, jm.ensemble(sweep, key, seeds=100), strict=True):
     ax = run.spectrum().mean().plot(ax, label=f"c_w = {task['c_w']:g} N s³/m³")
@@ -80,7 +80,7 @@ for task, run in zip(sweep, jm.ensemble(sweep, key, seeds=100), strict=True):
 SURE = """
 found = jm.posterior(result, target, key=jax.random.key(2))
 corner = jm.profile(result, "corner_frequency")
-refits = jm.bootstrap(result)
+refits = jm.checks.bootstrap(result)
 """
 PEOPLE = """
 import numpy as np
@@ -97,7 +97,7 @@ trials = [
 
 people = {}
 for i, name in enumerate(["ann", "ben", "eve", "jim", "kim", "tom"]):
-    one = jm.at_level(
+    one = jm.response.at_level(
         jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.2 + 0.1 * i, reference=0.26
     )
     power = np.asarray(
@@ -123,7 +123,7 @@ moved *= 1e-3 / np.std(moved)
 speed = np.gradient(moved, 1e-3)
 # a spring, damper, mass beside it
 force = held + 300.0 * moved + 6.0 * speed + 0.1 * np.gradient(speed, 1e-3)
-perturbed = jm.PerturbedRecording.from_array(force, moved, 1000, name="anna", window=(2.0, 60.0))
+perturbed = jm.data.PerturbedRecording.from_array(force, moved, 1000, name="anna", window=(2.0, 60.0))
 
 # a muscle, moved by sines from 0.1 to 5 Hz, 1 mm rms
 time, lines = np.arange(7200) / 100, np.arange(8, 361) / 72
@@ -135,14 +135,14 @@ muscle = jm.PrescribedLength(x_z=jm.model.Sampled.through(time, -length)).replac
     harmonic_amplitude=0.0
 )
 pulled = np.asarray(jm.simulate(muscle, key, duration=71.9, rate=100.0).output)
-minute = jm.PerturbedRecording.from_array(
+minute = jm.data.PerturbedRecording.from_array(
     pulled, length[: pulled.size], 100, name="a minute", window=(6.0, 66.0)
 )
 """
 STUDY = """
 rows = []
 for i, name in enumerate(people):
-    one = jm.at_level(jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.3, reference=0.26)
+    one = jm.response.at_level(jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.3, reference=0.26)
     for j, force in enumerate(
         np.asarray(jm.ensemble(jm.settled(one), jax.random.key(i), seeds=3, duration=25.0).output)
     ):
@@ -237,13 +237,13 @@ SECTIONS = (
             ),
             Shown(
                 "gallery/sensitivity.png",
-                "jm.sensitivity(result.task).plot()",
+                "jm.response.sensitivity(result.task).plot()",
                 "How much each parameter changes each bin",
                 "model.md",
             ),
             Shown(
                 "gallery/static.png",
-                "jm.static_characteristics(result.task).plot()",
+                "jm.response.static_characteristics(result.task).plot()",
                 "Stiffness, damping and force against displacement and velocity",
                 "scaling.md",
             ),
@@ -291,13 +291,13 @@ SECTIONS = (
             ),
             Shown(
                 "gallery/designed_input.png",
-                "jm.design_input(result).plot()",
+                "jm.uncertainty.design_input(result).plot()",
                 "A motion made to measure stiffness",
                 "perturbed-design.md",
             ),
             Shown(
                 "gallery/goodness.png",
-                "jm.goodness(result).plot()",
+                "jm.checks.goodness(result).plot()",
                 "Is the model right? Residuals against what is usual",
                 "goodness.md",
             ),
@@ -315,7 +315,7 @@ SECTIONS = (
             ),
             Shown(
                 "gallery/comparison.png",
-                "jm.compare_noise(jm.Isometric(), target).plot()",
+                "jm.comparison.compare_noise(jm.Isometric(), target).plot()",
                 "Which noise? Models compared",
                 "noise-colour.md",
             ),
@@ -333,13 +333,13 @@ SECTIONS = (
             ),
             Shown(
                 "gallery/trials.png",
-                "jm.Trials(trials).plot()",
+                "jm.data.Trials(trials).plot()",
                 "Five trials and their mean spectrum",
                 "recordings.md#several-trials-of-one-person",
             ),
             Shown(
                 "gallery/steadiness.png",
-                "jm.steadiness(trials).plot()",
+                "jm.data.steadiness(trials).plot()",
                 "How steady five trials are",
                 "recordings.md#steadiness",
             ),

@@ -19,7 +19,7 @@ from jaxmuscle.response._presets import PresetFile
 PAGE = Path(__file__).parent / "reference" / "parameters.md"
 HEAD = """# Parameters and units
 
-Look here for the name, unit, default and limits of a parameter. In Python `jm.PARAMETERS[name]` is the same row.
+Look here for the name, unit, default and limits of a parameter. In Python `jm.model.PARAMETERS[name]` is the same row.
 `docs/generate.py` writes this page from the code.
 
 ## One name everywhere
@@ -58,7 +58,7 @@ the task has them, `noise_correlation_time`, `activation_time` and all `resonanc
 and `m_z` are free.)
 
 A default task has no activation, no resonance, no second resonance and no other noise on the drive. For the first three the
-column *default* says with which value they begin when you add them (`jm.on_rung`, `jm.Activation()`, `jm.ResonantNoise()`).
+column *default* says with which value they begin when you add them (`jm.model.on_rung`, `jm.Activation()`, `jm.ResonantNoise()`).
 Noise on the drive you add with a value of your own: `task.replace(noise_P_w=0.02)` (0.02 in the
 table is a usual size). In
 `PrescribedMotion` `F_ext` is 10 N by default.
@@ -85,7 +85,7 @@ All units are SI: masses in kg, lengths in m, forces in N, times in s, frequenci
 squared length is a stiffness [N/m]. `c` [N s³/m³] times a squared velocity is a damping coefficient [N s/m]. The unit 1
 means a ratio: amplitudes of noise and harmonic are fractions of the stiffness or damping at rest, or of P_w.
 
-::: jaxmuscle.PARAMETERS
+::: jaxmuscle.model.PARAMETERS
 
 The table by name, a dictionary of `Parameter`.
 

@@ -89,7 +89,7 @@ def tendon_strain(force):
     return TOE * jnp.log1p(carried)
 
 
-class HillMuscle(jm.AbstractMuscle):
+class HillMuscle(jm.model.AbstractMuscle):
     """Contractile and parallel elastic element (the active tissue) in series with a tendon (the
     passive tissue).
 

@@ -205,7 +205,7 @@ if kind == "simulate":
     jm.simulate(task, 0, duration=2.0)
 elif kind == "spectrum":
     jm.expected_spectrum(task)
-    jm.steadiness(jm.Recording(np.random.default_rng(0).normal(5.0, 0.1, 4000), 100.0))
+    jm.data.steadiness(jm.Recording(np.random.default_rng(0).normal(5.0, 0.1, 4000), 100.0))
 elif kind == "speed":
     jm.ensembles.measure(task, 4, 0.2)
 else:

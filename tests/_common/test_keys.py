@@ -78,17 +78,17 @@ def public_calls(key):
     return {
         "simulate": lambda: jm.simulate(task, key),
         "ensemble": lambda: jm.ensemble(task, key, seeds=2),
-        "sweep": lambda: jm.ensemble(jm.Sweep.grid(task, k_w=[4e5, 5e5]), key, seeds=2),
+        "sweep": lambda: jm.ensemble(jm.ensembles.Sweep.grid(task, k_w=[4e5, 5e5]), key, seeds=2),
         "store": lambda: jm.ensemble(task, key, seeds=2, store="never.zarr"),
         "fit": lambda: jm.fit(task, target, key=key),
         "fit_joint": lambda: jm.fit_joint({"a": target}, key=key),
         "Monte Carlo": lambda: jm.fit(task, target, key=key, method="montecarlo"),
         "fit_cohort": lambda: jm.fit_cohort([target], key=key),
         "posterior": lambda: jm.posterior(result, key=key),
-        "goodness": lambda: jm.goodness(result, key=key),
-        "bootstrap": lambda: jm.bootstrap(result, key=key),
-        "compare_noise": lambda: jm.compare_noise(task, target, key=key),
-        "design_input": lambda: jm.design_input(
+        "goodness": lambda: jm.checks.goodness(result, key=key),
+        "bootstrap": lambda: jm.checks.bootstrap(result, key=key),
+        "compare_noise": lambda: jm.comparison.compare_noise(task, target, key=key),
+        "design_input": lambda: jm.uncertainty.design_input(
             task, "K_w0", rms=1e-3, band=(0.1, 5.0), seconds=60.0, key=key
         ),
         "run_study": lambda: jm.run_study("never.csv", key=key),

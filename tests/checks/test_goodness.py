@@ -37,8 +37,8 @@ CASES = 20
 def task():
     """A third of the default noise, about a linear response; no harmonic."""
     return jm.Isometric().replace(
-        noise_K_w=jm.PARAMETERS["noise_K_w"].default / 3,
-        noise_K_z=jm.PARAMETERS["noise_K_z"].default,
+        noise_K_w=jm.model.PARAMETERS["noise_K_w"].default / 3,
+        noise_K_z=jm.model.PARAMETERS["noise_K_z"].default,
         harmonic_amplitude=0.0,
     )
 
@@ -146,7 +146,8 @@ def test_reference_runs_are_those_of_correlated_bins(x64):
 def test_p_values_are_uniform_where_the_model_is_true():
     replicates = 19
     found = [
-        jm.goodness(result, replicates=replicates, key=i) for i, result in enumerate(drawn_fits())
+        jm.checks.goodness(result, replicates=replicates, key=i)
+        for i, result in enumerate(drawn_fits())
     ]
     for name in ("chi2_per_bin", "largest", "all"):
         values = [g.p_values[name] for g in found]
@@ -190,14 +191,14 @@ def linear_chi2(result):
 def test_line_that_the_model_cannot_have_is_found():
     power = expected().copy()
     power[15] *= 6.0
-    found = jm.goodness(fits([power])[0], replicates=199)
+    found = jm.checks.goodness(fits([power])[0], replicates=199)
     assert found.p_values["largest"] <= 0.01 and found.p_values["all"] <= 0.02
     assert "one bin stands out" in found.sentences[2] and "6.25 Hz" in found.sentences[2]
 
 
 def test_smooth_misfit_is_found_by_the_runs():
     wave = np.exp(0.35 * np.sin(2 * np.pi * 1.5 * np.arange(30) / 30))
-    found = jm.goodness(fits([expected() * wave])[0], replicates=199)
+    found = jm.checks.goodness(fits([expected() * wave])[0], replicates=199)
     assert found.p_values["runs"] <= 0.01
     assert found.p_values["largest"] > 0.5  # nothing but the order of the signs is odd
     assert "the fit is too high or too low over whole ranges of frequency" in found.sentences[1]
@@ -228,8 +229,8 @@ def test_refits_reach_the_minima_of_a_full_search(x64):
 def test_another_target_is_foretold_not_fitted():
     first, second = drawn_fits()[:2]
     own, other = (
-        jm.goodness(first, replicates=199),
-        jm.goodness(first, second.target, replicates=199),
+        jm.checks.goodness(first, replicates=199),
+        jm.checks.goodness(first, second.target, replicates=199),
     )
     assert other.foretold and not own.foretold
     # A spectrum that was not fitted lies further from the fit: twice the take-up of two parameters,
@@ -249,7 +250,7 @@ def test_another_target_is_foretold_not_fitted():
 
 def test_key_decides_and_figures_are_drawn():
     result = drawn_fits()[2]
-    a, b, c = (jm.goodness(result, replicates=49, key=k) for k in (1, 1, 2))
+    a, b, c = (jm.checks.goodness(result, replicates=49, key=k) for k in (1, 1, 2))
     assert a.p_values == b.p_values
     np.testing.assert_array_equal(a.residuals, b.residuals)
     assert not np.array_equal(a.residuals, c.residuals)
@@ -268,12 +269,12 @@ def test_key_decides_and_figures_are_drawn():
 def test_goodness_refuses():
     result = perfect()
     with pytest.raises(ValueError, match="at least 19"):
-        jm.goodness(result, replicates=10)
+        jm.checks.goodness(result, replicates=10)
     silent = eqx.tree_at(lambda r: r.target, result, Target("silent", expected()))
     with pytest.raises(ValueError, match="silent: states neither segments nor sigma"):
-        jm.goodness(silent)
+        jm.checks.goodness(silent)
     with pytest.raises(ValueError, match="other bins or spectrum settings"):
-        jm.goodness(result, Target("short", expected()[:20], bins=range(1, 21), segments=12))
+        jm.checks.goodness(result, Target("short", expected()[:20], bins=range(1, 21), segments=12))
 
 
 def test_verdicts_of_known_refits():
@@ -292,17 +293,17 @@ def test_verdicts_of_known_refits():
 
 def test_bootstrap_refuses():
     with pytest.raises(ValueError, match="at least 2"):
-        jm.bootstrap(perfect(), replicates=1)
+        jm.checks.bootstrap(perfect(), replicates=1)
     silent = eqx.tree_at(lambda r: r.target, perfect(), Target("silent", expected()))
     with pytest.raises(ValueError, match="silent: states neither segments nor sigma"):
-        jm.bootstrap(silent)
+        jm.checks.bootstrap(silent)
 
 
 @functools.cache
 def bootstrapped():
     result = fits([expected()], segments=(20, 12))[0]
     with without_intervals():
-        return jm.bootstrap(result, replicates=40, key=3)
+        return jm.checks.bootstrap(result, replicates=40, key=3)
 
 
 def bounds(q):
@@ -344,9 +345,9 @@ def test_bootstrap_is_told_saved_and_drawn(tmp_path):
 def test_bootstrap_of_a_sigma_draws_from_the_gaussian_law():
     result = fits([expected()], segments=None, sigma=0.2 * expected())[0]
     with without_intervals():
-        found = jm.bootstrap(result, replicates=20, key=1)
+        found = jm.checks.bootstrap(result, replicates=20, key=1)
         a, b, c = (
-            jm.bootstrap(result, replicates=2, key=key).quantities["c_w"].values
+            jm.checks.bootstrap(result, replicates=2, key=key).quantities["c_w"].values
             for key in (1, 1, 2)
         )
     assert "not simulated" in str(found).replace("\n  ", " ")
@@ -367,7 +368,7 @@ def test_what_cannot_be_simulated_is_reported(monkeypatch):
         return ensemble(task, key, seeds=seeds, **options)
 
     monkeypatch.setattr(_bootstrap_data, "ensemble", breaking)
-    found = jm.bootstrap(perfect(), replicates=4)
+    found = jm.checks.bootstrap(perfect(), replicates=4)
     assert list(found.failed) == [2] and "did not stay finite" in found.failed[2]
     assert not found.success and "1 of 4 failed" in str(found)
     assert all(len(q.values) == 3 for q in found.quantities.values())

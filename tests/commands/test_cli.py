@@ -397,7 +397,6 @@ def test_help_of_fit_names_every_option():
         "task",
         "method",
         "noise",
-        "residual",
         "free",
         "fix",
         "starts",
@@ -730,7 +729,7 @@ def test_one_model_of_the_ladder_is_fitted(tmp_path, monkeypatch):
         ).exit_code
         == 0
     )
-    assert seen["task"] == jm.on_rung(jm.Isometric(), 2) and seen["rungs"] == 0
+    assert seen["task"] == jm.model.on_rung(jm.Isometric(), 2) and seen["rungs"] == 0
 
 
 def test_a_failing_simulation_is_not_a_users_mistake(tmp_path, monkeypatch):
@@ -1029,7 +1028,7 @@ def test_what_a_fit_has_settled_cannot_be_asked_for_again(option, tmp_path):
 
 def made_comparison(target, *, success):
     """Two models; the search of the second one ended as told."""
-    task = jm.on_rung(jm.Isometric(), 2)
+    task = jm.model.on_rung(jm.Isometric(), 2)
     scores = np.linspace(-2.0, -1.0, len(target.bins))
     rows = [
         jm.comparison.ComparedModel(
@@ -1217,7 +1216,9 @@ def test_steadiness_of_trials(tmp_path):
     )
     windows = ((0, 8), (1, 8), (0, 8))
     each = zip(files, windows, strict=False)
-    found = jm.steadiness([jm.load_recording(str(file)).steady(window) for file, window in each])
+    found = jm.data.steadiness(
+        [jm.load_recording(str(file)).steady(window) for file, window in each]
+    )
     with open(tmp_path / "out" / "steadiness.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["trial"] for row in rows[:: len(found.measures)]] == [
@@ -1269,7 +1270,7 @@ ASKED = (
 @functools.cache
 def designed():
     """What these options ask for."""
-    return jm.design_input(
+    return jm.uncertainty.design_input(
         jm.Isometric(),
         ("K_w0", "C_w0"),
         rms=5e-4,

@@ -150,7 +150,7 @@ def read(monkeypatch):
 def test_a_command_reads_a_file_once(folder, tmp_path, read):
     reading = {name: default for name, (_, default) in (READING | PERTURBED).items()}
     trials = read_recordings([str(path) for path in paths(folder, 3)], reading, None, None)
-    assert isinstance(trials, jm.Trials) and read == [str(path) for path in paths(folder, 3)]
+    assert isinstance(trials, jm.data.Trials) and read == [str(path) for path in paths(folder, 3)]
     x, noise = np.random.default_rng(9).standard_normal((2, 4000))
     columns = [np.arange(4000) / RATE, 40 + 0.3 * x + 0.1 * noise, x]
     path = str(tmp_path / "both.csv")
@@ -165,7 +165,7 @@ def test_a_command_reads_a_file_once(folder, tmp_path, read):
         read.clear()
         (found,) = read_recordings([path], reading | options, "2:18", "prescribed-length")
         assert (
-            isinstance(found, jm.PerturbedRecording)
+            isinstance(found, jm.data.PerturbedRecording)
             and found.window == pytest.approx((2, 18))
             and read == [path]
         )
@@ -189,7 +189,7 @@ def test_two_commands_from_raw_trials_to_a_fit(folder, tmp_path):
     again = jm.load_result(tmp_path / "one" / "fit.json")
     assert again["model_mean"].value == pytest.approx(mean.value)
     assert again.chi2_per_bin == pytest.approx(result.chi2_per_bin)
-    own = jm.steadiness(held)
+    own = jm.data.steadiness(held)
     for name in ("mean", "coefficient_of_variation", "sample_entropy", "median_frequency"):
         assert again[name] == result[name] == own[name]
 
@@ -227,7 +227,7 @@ def test_a_joint_that_is_held_needs_no_lever_arm(tmp_path):
     held, moved = with_angle(tmp_path / "held.csv", 0.05), with_angle(tmp_path / "moved.csv", 1.0)
     with contextlib.redirect_stderr(io.StringIO()):
         found = read_recordings([held], reading, None, None)
-    assert isinstance(found, jm.Trials) and found[0].unit == "N m"
+    assert isinstance(found, jm.data.Trials) and found[0].unit == "N m"
     assert recordings_of(held) == () and as_target(held).unit == "N m"
     with pytest.raises(
         ValueError,

@@ -75,7 +75,7 @@ def few_starts():
 
 def compare(task, target, **options):
     with few_starts():
-        return jm.compare_noise(task, target, **options)
+        return jm.comparison.compare_noise(task, target, **options)
 
 
 @functools.cache
@@ -122,7 +122,7 @@ def test_a_noise_and_its_limit_are_not_told_apart():
 def test_a_tremor_is_told_from_a_line():
     """A broad tremor behind an activation; a harmonic is asked for only of the models that may have
     one."""
-    task = jm.on_rung(jm.Isometric(), 2).replace(resonance_amplitude=0.1, noise_K_z=0.002)
+    task = jm.model.on_rung(jm.Isometric(), 2).replace(resonance_amplitude=0.1, noise_K_z=0.002)
     free = ("noise_K_z", "resonance_amplitude", "harmonic_amplitude", "harmonic_frequency")
     found = compare(
         jm.Isometric(),
@@ -307,7 +307,7 @@ def test_without_harmonic_its_power_is_zero(x64):
 def test_a_richer_model_is_also_sought_from_where_the_best_poorer_one_ended(x64):
     """From the prior's centre alone a muscle that rings at the tremor's frequency was missed by 100
     in AIC."""
-    task, on = jm.Isometric(), functools.partial(jm.on_rung, jm.Isometric())
+    task, on = jm.Isometric(), functools.partial(jm.model.on_rung, jm.Isometric())
     ended = {
         ("band-limited", True): {"aic": 30.0, "task": task},
         # another noise than the tremor's
@@ -527,7 +527,7 @@ def test_what_a_task_cannot_carry_is_left_out_with_its_own_reason():
     )
     assert tuple(carried) == ("white", *COLOURS) and left_out == {}
     carried, left_out = _compare._carry(
-        jm.on_rung(jm.Isometric(), 1), ("band-limited", "pink", "resonance"), {}
+        jm.model.on_rung(jm.Isometric(), 1), ("band-limited", "pink", "resonance"), {}
     )
     assert (
         tuple(carried) == ("band-limited", "pink")
@@ -570,13 +570,13 @@ BAD = {
 def test_bad_arguments(case):
     task, options, message = BAD[case]
     with pytest.raises(ValueError, match=message):
-        jm.compare_noise(task(), jm.load_target(FORCE), **options)
+        jm.comparison.compare_noise(task(), jm.load_target(FORCE), **options)
 
 
 def test_a_target_has_to_say_how_much_it_scatters():
     target = jm.Target("mine", 1 / np.arange(1, 31))
     with pytest.raises(ValueError, match="mine: states neither segments nor sigma"):
-        jm.compare_noise(jm.Isometric(), target)
+        jm.comparison.compare_noise(jm.Isometric(), target)
 
 
 def test_with_a_sigma_alone_nothing_is_held_out():

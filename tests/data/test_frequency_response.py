@@ -30,7 +30,7 @@ def test_error_by_coherence_is_that_of_a_regression():
     noise = 4.0
     found = np.sum(x.conj() * (h * x + noise * n), axis=1) / np.sum(np.abs(x) ** 2, axis=1)
     coherence = abs(h) ** 2 / (abs(h) ** 2 + noise**2)
-    stated = jm.FrequencyResponse.from_gain(
+    stated = jm.data.FrequencyResponse.from_gain(
         [1.0], [abs(h)], [0.0], coherence=[coherence], segments=k
     ).stderr[0]
     # Given X the variance is S / Σ|X|², on the average K / (K - 1) times S / (K S_X).
@@ -41,7 +41,7 @@ def test_error_by_coherence_is_that_of_a_regression():
 
 
 def test_gain_phase_and_back():
-    response = jm.FrequencyResponse.from_gain(
+    response = jm.data.FrequencyResponse.from_gain(
         F, GAIN, PHASE, coherence=COHERENCE, segments=[10, 20, 30, 40], **FIELDS
     )
     np.testing.assert_allclose(response.gain, GAIN)
@@ -52,7 +52,7 @@ def test_gain_phase_and_back():
 
 
 def test_no_coherence_no_error():
-    response = jm.FrequencyResponse.from_gain(
+    response = jm.data.FrequencyResponse.from_gain(
         F, GAIN, PHASE, coherence=[0.9, 0.9, 0.0, 0.9], segments=10
     )
     assert np.isinf(response.stderr[2])
@@ -64,7 +64,7 @@ def test_no_response_is_told_from_a_small_one():
     add up are one."""
     f, sd, rng = np.linspace(0.5, 12.0, 48), np.linspace(5.0, 20.0, 48), np.random.default_rng(3)
     errors = sd * (rng.standard_normal((2000, 48, 2)) @ [1, 1j])
-    p = np.array([jm.FrequencyResponse(f, error, sd).p_none for error in errors])
+    p = np.array([jm.data.FrequencyResponse(f, error, sd).p_none for error in errors])
     for level in (0.05, 0.2):
         spread = 4 * np.sqrt(level / p.size)
         assert 0.6 * level - spread < np.mean(p <= level) < level + spread
@@ -73,41 +73,46 @@ def test_no_response_is_told_from_a_small_one():
     assert spring < np.median(sd)
     assert (
         np.mean(
-            [jm.FrequencyResponse(f, error + spring, sd).p_none <= 1e-3 for error in errors[:200]]
+            [
+                jm.data.FrequencyResponse(f, error + spring, sd).p_none <= 1e-3
+                for error in errors[:200]
+            ]
         )
         > 0.9
     )
     assert "does not follow the displacement" in str(
-        jm.FrequencyResponse(f, errors[np.argmax(p)], sd)
+        jm.data.FrequencyResponse(f, errors[np.argmax(p)], sd)
     )
-    assert "does not follow" not in str(jm.FrequencyResponse(f, errors[0] + 10 * spring, sd))
+    assert "does not follow" not in str(jm.data.FrequencyResponse(f, errors[0] + 10 * spring, sd))
     # A point without error counts for nothing.
-    assert jm.FrequencyResponse(
+    assert jm.data.FrequencyResponse(
         f, errors[0], np.where(f < 0.6, np.inf, sd)
-    ).p_none == pytest.approx(jm.FrequencyResponse(f[1:], errors[0][1:], sd[1:]).p_none, rel=1e-9)
+    ).p_none == pytest.approx(
+        jm.data.FrequencyResponse(f[1:], errors[0][1:], sd[1:]).p_none, rel=1e-9
+    )
 
 
 def test_tables_are_exact():
     for coherence in (COHERENCE, None):
-        response = jm.FrequencyResponse(
+        response = jm.data.FrequencyResponse(
             F, GAIN * np.exp(1j * PHASE), [1.5, np.inf, 0.1, 1 / 3], coherence, **FIELDS
         )
         table = response.to_table()
-        equal(response, jm.FrequencyResponse.from_table(table))
+        equal(response, jm.data.FrequencyResponse.from_table(table))
         equal(
             response,
-            jm.FrequencyResponse.from_table(json.loads(json.dumps(table, allow_nan=False))),
+            jm.data.FrequencyResponse.from_table(json.loads(json.dumps(table, allow_nan=False))),
         )
-        equal(response, jm.FrequencyResponse.from_table(tomllib.loads(tomli_w.dumps(table))))
+        equal(response, jm.data.FrequencyResponse.from_table(tomllib.loads(tomli_w.dumps(table))))
 
 
 def test_saved_and_loaded(tmp_path):
     for coherence in (COHERENCE, None):
-        response = jm.FrequencyResponse.from_gain(
+        response = jm.data.FrequencyResponse.from_gain(
             F, GAIN, PHASE, coherence=coherence, stderr=[1.5, np.inf, 0.1, 1 / 3]
         )
         response.save(tmp_path / "response.csv")
-        again = jm.load_frequency_response(tmp_path / "response.csv")
+        again = jm.data.load_frequency_response(tmp_path / "response.csv")
         np.testing.assert_allclose(again.value, response.value, rtol=1e-14)
         np.testing.assert_array_equal(again.stderr, response.stderr)
         np.testing.assert_array_equal(again.coherence, response.coherence)
@@ -134,10 +139,10 @@ def test_units_in_headers(header, tmp_path):
     path.write_text(
         f"# Smith 1999\n{header}\n" + "\n".join(",".join(map(repr, row)) for row in rows.tolist())
     )
-    found = jm.load_frequency_response(
+    found = jm.data.load_frequency_response(
         path, segments=12, lever_arm=0.04 if "Nm" in header or "·" in header else None
     )
-    wanted = jm.FrequencyResponse.from_gain(F, GAIN, PHASE, coherence=COHERENCE, segments=12)
+    wanted = jm.data.FrequencyResponse.from_gain(F, GAIN, PHASE, coherence=COHERENCE, segments=12)
     np.testing.assert_allclose(found.value, wanted.value, rtol=1e-12)
     np.testing.assert_allclose(found.stderr, wanted.stderr, rtol=1e-12)
 
@@ -145,11 +150,11 @@ def test_units_in_headers(header, tmp_path):
 def test_decibel_and_errors_in_the_unit_of_the_gain(tmp_path):
     path = tmp_path / "figure.csv"
     path.write_text("coherence;gain_dB;phase;f;stderr_N/m\n0,9;60;3;0,5;12,5\n0,8;40;4;1;1,5\n")
-    found = jm.load_frequency_response(path)
+    found = jm.data.load_frequency_response(path)
     np.testing.assert_allclose(found.gain, [1000, 100])
     np.testing.assert_array_equal(found.stderr, [12.5, 1.5])
     path.write_text("stderr,frequency_hz,gain_N/mm,phase_deg\n0.1,1,5,3\n0.2,2,5,3\n")
-    np.testing.assert_allclose(jm.load_frequency_response(path).stderr, [100, 200])
+    np.testing.assert_allclose(jm.data.load_frequency_response(path).stderr, [100, 200])
 
 
 def test_a_table_that_a_fit_wrote_is_read_without_what_was_fitted(tmp_path):
@@ -157,7 +162,7 @@ def test_a_table_that_a_fit_wrote_is_read_without_what_was_fitted(tmp_path):
     path.write_text(
         "frequency_hz,real,imaginary,stderr,fitted_real,fitted_imaginary\n1,100,-20,3,90,1\n2,80,5,inf,90,1\n"
     )
-    found = jm.load_frequency_response(path, name="own")
+    found = jm.data.load_frequency_response(path, name="own")
     np.testing.assert_allclose(found.value, [100 - 20j, 80 + 5j], rtol=1e-12)
     np.testing.assert_array_equal(found.stderr, [3, np.inf])
     assert (found.name, found.source) == ("own", "stiffness.csv")
@@ -167,7 +172,7 @@ def test_a_table_that_a_fit_wrote_is_read_without_what_was_fitted(tmp_path):
 def test_a_target_with_a_stiffness_is_saved_and_read_back_equal(spectrum, tmp_path):
     """Also one that has a stiffness and no spectrum, whose frequencies and powers are empty
     lists."""
-    measured = jm.FrequencyResponse(
+    measured = jm.data.FrequencyResponse(
         F,
         GAIN * np.exp(1j * np.radians(PHASE)),
         [3.0, 4.0, np.inf, 5.0],
@@ -191,7 +196,7 @@ def test_a_target_with_a_stiffness_is_saved_and_read_back_equal(spectrum, tmp_pa
 def test_a_mean_without_a_spectrum_is_known_to_two_percent():
     """Its density at low frequencies is not known: the error is that of a target without
     segments."""
-    measured = jm.FrequencyResponse(F, GAIN, 5.0 * np.ones(4))
+    measured = jm.data.FrequencyResponse(F, GAIN, 5.0 * np.ones(4))
     stated = {"mean": 20.0, "unit": "N", "stiffness": measured}
     with_all = jm.Target("anna", None, segments=12, coefficient_of_variation=0.02, **stated)
     assert (
@@ -260,7 +265,7 @@ def test_damaged_files(case, tmp_path):
     path = tmp_path / "figure.csv"
     path.write_text(text)
     with pytest.raises(ValueError) as error:
-        jm.load_frequency_response(path, segments=10)
+        jm.data.load_frequency_response(path, segments=10)
     assert words in str(error.value)
     assert str(path) in str(error.value)
 
@@ -276,13 +281,17 @@ def test_refused():
         ({"value": ["a"] * 4}, "value: give numbers"),
     ):
         with pytest.raises(ValueError) as error:
-            jm.FrequencyResponse(**({"frequency": F, "value": GAIN + 0j, "stderr": GAIN} | change))
+            jm.data.FrequencyResponse(
+                **({"frequency": F, "value": GAIN + 0j, "stderr": GAIN} | change)
+            )
         assert words in str(error.value)
 
 
 def test_figure_has_errors():
-    figure = jm.FrequencyResponse.from_gain(F, GAIN, PHASE, coherence=COHERENCE, segments=10).plot()
+    figure = jm.data.FrequencyResponse.from_gain(
+        F, GAIN, PHASE, coherence=COHERENCE, segments=10
+    ).plot()
     assert [len(ax.containers) for ax in figure.axes] == [1, 1, 1]
     assert figure.axes[0].get_yscale() == "log"
-    without = jm.FrequencyResponse.from_gain(F, GAIN, PHASE, stderr=GAIN / 10).plot()
+    without = jm.data.FrequencyResponse.from_gain(F, GAIN, PHASE, stderr=GAIN / 10).plot()
     assert [len(ax.containers) for ax in without.axes] == [1, 1, 0]

@@ -362,7 +362,7 @@ READERS = {
     "fit.json": jm.load_result,
     "study.csv": read_study,
     "study.toml": read_study,
-    "response.csv": jm.load_frequency_response,
+    "response.csv": jm.data.load_frequency_response,
 }
 
 

@@ -49,8 +49,8 @@ def drawn(power, count, segments=SEGMENTS, seed=0):
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_target_of_recordings_carries_what_steadiness_measures(count, tmp_path):
     held = trials(count)
-    wanted = jm.steadiness(held).measures
-    target = (jm.Trials(held) if count > 1 else held[0]).target()
+    wanted = jm.data.steadiness(held).measures
+    target = (jm.data.Trials(held) if count > 1 else held[0]).target()
     assert list(target.measured) == list(wanted)
     np.testing.assert_equal(rows(target.measured), rows(wanted))
     assert target.with_measures() is target
@@ -67,7 +67,7 @@ def test_they_are_of_the_recording_whatever_the_settings_of_the_spectrum():
     held = jm.Recording(forces(3, 15.0)[0] - 10.0, 100.0, unit="mm")
     for recording in (trials()[0], held):
         target = recording.target(settings=settings)
-        np.testing.assert_equal(rows(target.measured), rows(jm.steadiness(recording).measures))
+        np.testing.assert_equal(rows(target.measured), rows(jm.data.steadiness(recording).measures))
     assert "tremor_size" in target.measured and target.measured["mean"].unit == "mm"
 
 
@@ -158,7 +158,9 @@ def test_what_is_unknown_of_a_spectrum_is_not_measured():
     bins = np.arange(1, 22)
     short = jm.Target("short", SMOOTH[:21], bins=bins, segments=SEGMENTS).measured
     assert "share_4_8" in short and not {"share_8_12", "median_frequency"} & set(short)
-    alone = jm.Target("none", None, stiffness=jm.FrequencyResponse([1.0, 2.0], [3.0, 4.0], [1, 1]))
+    alone = jm.Target(
+        "none", None, stiffness=jm.data.FrequencyResponse([1.0, 2.0], [3.0, 4.0], [1, 1])
+    )
     assert alone.measured == {}
 
 

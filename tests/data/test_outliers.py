@@ -207,7 +207,7 @@ def test_a_cough_or_a_slip_is_named(case, count):
     t = np.arange(1500) / RATE
     holds = [held(seed)[400:1900] for seed in range(count)]
     holds[-1] = holds[-1] + EVENTS[case](t)
-    trials = jm.Trials(
+    trials = jm.data.Trials(
         [jm.Recording(x, RATE, name=f"trial{i}", window=(0, 15)) for i, x in enumerate(holds)]
     )
     (said,) = [n for n in trials.target().notices if "leaves its level" in n]
@@ -215,7 +215,9 @@ def test_a_cough_or_a_slip_is_named(case, count):
     begin, stop = (float(word) for word in said.split(" from ")[1].split(" s,")[0].split(" to "))
     assert 5.0 <= begin <= 6.1 and 6.3 <= stop <= 7.6
     assert not noticed(trials.target(), "level goes from")
-    without = jm.Trials([*list(trials)[: count - 1], jm.Recording(holds[-1], RATE, window=(8, 15))])
+    without = jm.data.Trials(
+        [*list(trials)[: count - 1], jm.Recording(holds[-1], RATE, window=(8, 15))]
+    )
     assert not noticed(without.target(), "leaves its level")
 
 

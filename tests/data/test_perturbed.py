@@ -66,7 +66,7 @@ def drawn(seeds, noise, rate=RATE, seed=0):
 
 
 def recorded(displacement, force, rate=RATE, **options):
-    return jm.PerturbedRecording.from_array(force, displacement, rate, **options)
+    return jm.data.PerturbedRecording.from_array(force, displacement, rate, **options)
 
 
 @pytest.fixture(scope="module")
@@ -548,9 +548,9 @@ def test_channels_must_be_alike():
         (jm.Recording(x[1:], 100, unit="m"), "399 samples"),
     ):
         with pytest.raises(ValueError) as error:
-            jm.PerturbedRecording(force, other)
+            jm.data.PerturbedRecording(force, other)
         assert words in str(error.value)
-    assert jm.PerturbedRecording(force, moved, name="anna").name == "anna"
+    assert jm.data.PerturbedRecording(force, moved, name="anna").name == "anna"
     with pytest.raises(ValueError, match="displacement='399 samples'"):
         recorded(x[1:], x)
 
@@ -579,11 +579,11 @@ def test_the_command(file, tmp_path):
     assert "H = K + iωB - ω²I" in text
     assert "analysis.json, response.csv, analysis.png" in text
     found = json.loads((tmp_path / "analysis.json").read_text())
-    response = jm.FrequencyResponse.from_table(found["response"])
+    response = jm.data.FrequencyResponse.from_table(found["response"])
     held = jm.load_recording(file, force="force_N", displacement="displacement_mm").steady()
     np.testing.assert_allclose(response.value, held.frequency_response().value, rtol=1e-10)
     np.testing.assert_allclose(
-        jm.load_frequency_response(tmp_path / "response.csv").value, response.value
+        jm.data.load_frequency_response(tmp_path / "response.csv").value, response.value
     )
     wanted = {name: (m.value, m.stderr, m.unit) for name, m in held.second_order().items()}
     for name, numbers in wanted.items():
@@ -647,6 +647,6 @@ def test_the_page(file, tmp_path, monkeypatch):
         )
     assert names["published"].frequency.size == 3
     np.testing.assert_allclose(
-        jm.load_frequency_response("response.csv").value, names["response"].value
+        jm.data.load_frequency_response("response.csv").value, names["response"].value
     )
     assert (tmp_path / "perturbed.png").stat().st_size > 20_000

@@ -164,10 +164,10 @@ def test_a_maximal_contraction_begins_at_rest():
 
 def test_the_force_of_a_moved_record_counts_from_rest():
     moved = 1e-3 * np.random.default_rng(11).normal(size=T.size) * (SHAPE == 1)
-    found = jm.PerturbedRecording.from_array(HELD - 60, moved, RATE, positive="lengthening")
+    found = jm.data.PerturbedRecording.from_array(HELD - 60, moved, RATE, positive="lengthening")
     assert np.mean(found.steady((4, 20)).force.samples) == pytest.approx(LEVEL, rel=5e-3)
     assert not noticed(found, "mean force is negative")
-    kept = jm.PerturbedRecording.from_array(
+    kept = jm.data.PerturbedRecording.from_array(
         HELD + 20, moved, RATE, positive="lengthening", baseline="none"
     )
     np.testing.assert_array_equal(kept.force.whole, HELD + 20)

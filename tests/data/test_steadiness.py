@@ -78,7 +78,7 @@ def first(less=0.0, **fields):
 
 @pytest.fixture(scope="module")
 def found():
-    return jm.steadiness(trials())
+    return jm.data.steadiness(trials())
 
 
 @pytest.fixture
@@ -117,7 +117,7 @@ def band_powers(x):
 
 def test_each_number_of_one_recording():
     recording = trials()[0]
-    x, one = np.ascontiguousarray(recording.filtered()), jm.steadiness(recording)
+    x, one = np.ascontiguousarray(recording.filtered()), jm.data.steadiness(recording)
     line = np.polyval(np.polyfit(np.arange(x.size), x, 1), np.arange(x.size))
     powers = band_powers(x)
     expected = {
@@ -148,7 +148,7 @@ def test_each_number_of_one_recording():
 
 
 def test_powers_add_up_to_the_variance(found):
-    for measures in (*found.trials.values(), jm.steadiness(trials()[0]).measures):
+    for measures in (*found.trials.values(), jm.data.steadiness(trials()[0]).measures):
         powers = [measures[f"power{name}"].value for name in RANGES]
         variance = measures["standard_deviation"].value ** 2
         assert sum(powers) == pytest.approx(variance, rel=1e-9) and min(powers) > 0
@@ -232,7 +232,7 @@ def test_three_trials_scatter_and_two_do_not(found):
         values = [own[name].value for own in found.trials.values()]
         assert found[name].value == pytest.approx(np.mean(values))
         assert found[name].stderr == pytest.approx(scipy.stats.sem(values))
-    two = jm.steadiness(trials()[:2])
+    two = jm.data.steadiness(trials()[:2])
     for name in set(two.measures) - TREMOR:
         values, errors = np.array(
             [(own[name].value, own[name].stderr) for own in two.trials.values()]
@@ -272,7 +272,7 @@ def test_the_size_of_a_tremor_is_its_deviation_over_the_mean():
     """The hill of 30 recordings together, ± 2.7 Hz about 9 Hz, in closed form. Its power scatters
     by 2 % there, and a smooth spectrum that follows the floor imperfectly moves it by a few
     percent."""
-    found = jm.steadiness([jm.Recording(x, RATE) for x in forces(30, 15.0)])
+    found = jm.data.steadiness([jm.Recording(x, RATE) for x in forces(30, 15.0)])
     f = np.linspace(0, 50, 400_001)
     hill = density(f, 1) - density(f, 0)
     near = np.abs(f - 9) < 2.7
@@ -283,15 +283,15 @@ def test_the_size_of_a_tremor_is_its_deviation_over_the_mean():
 
 def test_a_band_is_looked_through(found):
     """A hill at 9 Hz is none from 3 to 6 Hz; what moves is looked through from 3 to 20 Hz."""
-    slower = jm.steadiness(trials(), band=(3.0, 6.0))
+    slower = jm.data.steadiness(trials(), band=(3.0, 6.0))
     assert slower.band == (3.0, 6.0) and not 8 < slower["tremor_frequency"].value < 10
     assert found.band == (6.0, 12.0) and "tremor, 6 to 12 Hz " in str(found)
     assert "size that would show" not in str(found)  # it shows
-    moving = jm.steadiness(first(LEVEL, unit="mm"))
+    moving = jm.data.steadiness(first(LEVEL, unit="mm"))
     assert moving.band == (3.0, 20.0) and moving["tremor_size"].unit == "mm"
     assert moving["tremor_frequency"].value == pytest.approx(9, abs=1)
     with pytest.raises(ValueError, match="band"):
-        jm.steadiness(trials(), band=(30.0, 40.0))
+        jm.data.steadiness(trials(), band=(30.0, 40.0))
 
 
 def test_segments_average_to_the_welch_spectrum():
@@ -305,7 +305,7 @@ def test_segments_average_to_the_welch_spectrum():
 
 def test_no_tremor_is_no_number():
     """A recording without one shows one in 1 of 100: of 30 more than 3 do once in 3000."""
-    each = [jm.steadiness(jm.Recording(x, RATE)) for x in forces(30, 15.0, tremor=0, seed=3)]
+    each = [jm.data.steadiness(jm.Recording(x, RATE)) for x in forces(30, 15.0, tremor=0, seed=3)]
     without = [one for one in each if math.isnan(one["tremor_frequency"].value)]
     assert len(without) >= 27
     none = without[0]
@@ -320,24 +320,29 @@ def test_no_tremor_is_no_number():
 def test_rates_may_differ():
     x = forces(3, 15.0)[0]
     fine = scipy.signal.resample_poly(x, 10, 1, padtype="line")
-    same, other = jm.steadiness(jm.Recording(x, RATE)), jm.steadiness(jm.Recording(fine, 10 * RATE))
+    same, other = (
+        jm.data.steadiness(jm.Recording(x, RATE)),
+        jm.data.steadiness(jm.Recording(fine, 10 * RATE)),
+    )
     for name in ("mean", CV, "power_0.5_1", "power_8_12", "dfa_exponent"):
         assert other[name].value == pytest.approx(same[name].value, rel=5e-3), name
-    both = jm.steadiness([jm.Recording(x, RATE), jm.Recording(fine, 10 * RATE)])
+    both = jm.data.steadiness([jm.Recording(x, RATE), jm.Recording(fine, 10 * RATE)])
     assert list(both.trials) == ["recording 1", "recording 2"]
 
 
 def test_the_window_is_what_counts():
     x = np.concatenate([np.linspace(0, LEVEL, 500), forces(3, 15.0)[0]])
     held = jm.Recording(x, RATE).steady((5.0, 20.0))
-    assert jm.steadiness(held)["mean"].value == pytest.approx(forces(3, 15.0)[0].mean(), rel=1e-3)
+    assert jm.data.steadiness(held)["mean"].value == pytest.approx(
+        forces(3, 15.0)[0].mean(), rel=1e-3
+    )
 
 
 @pytest.mark.parametrize(
     "unit, square", [("% MVC", "(% MVC)²"), ("a.u.", "(a.u.)²"), ("N m", "(N m)²"), ("N", "N²")]
 )
 def test_units_are_said_as_they_are(unit, square):
-    one = jm.steadiness(first(unit=unit))
+    one = jm.data.steadiness(first(unit=unit))
     assert (
         one["mean"].unit == unit
         and one["power_0_0.5"].unit == square.replace("²", "^2")
@@ -347,7 +352,7 @@ def test_units_are_said_as_they_are(unit, square):
     assert f"[{unit}]" in text and f" {unit}  " in text and square not in text
     assert "\npower by band, in millionths of the squared mean\n" in text
     assert max(len(line) for line in text.splitlines()) <= 80
-    about = jm.steadiness(first(LEVEL, unit=unit))
+    about = jm.data.steadiness(first(LEVEL, unit=unit))
     assert f"\npower by band [{square}]\n" in str(about) and math.isnan(
         about["relative_power_8_12"].value
     )
@@ -367,13 +372,13 @@ def test_mistakes_are_named(user_view):
         ),
     ):
         with pytest.raises(ValueError, match=message):
-            jm.steadiness(wrong)
+            jm.data.steadiness(wrong)
     with pytest.raises(ValueError, match="did you mean 'sample_entropy'"):
-        jm.steadiness(newtons)["sample_entrpy"]
+        jm.data.steadiness(newtons)["sample_entrpy"]
 
 
 def test_a_mean_near_zero_has_no_variation():
-    about = jm.steadiness(first(LEVEL, unit="mm"))
+    about = jm.data.steadiness(first(LEVEL, unit="mm"))
     assert math.isnan(about[CV].value) and about["standard_deviation"].stderr > 0
     assert "near zero" in about.notices[-1] and "coefficient of variation    none" in str(about)
 
@@ -389,7 +394,10 @@ def test_a_level_that_wanders_is_noticed():
     ]
     assert sum(said[:40]) <= 7 and sum(said[40:]) >= 15
     (notice,) = _steadiness._notice_wandering([walks[int(np.flatnonzero(said[40:])[0])]])
-    assert notice in jm.steadiness(jm.Recording(walks[np.flatnonzero(said[40:])[0]], RATE)).notices
+    assert (
+        notice
+        in jm.data.steadiness(jm.Recording(walks[np.flatnonzero(said[40:])[0]], RATE)).notices
+    )
 
 
 def test_trials_of_different_length_are_noticed():
@@ -397,8 +405,8 @@ def test_trials_of_different_length_are_noticed():
         first(),
         jm.Recording(forces(3, 15.0)[1][:900], RATE),
     )
-    assert "the trials last 9 s to 15 s" in jm.steadiness([long, short]).notices[-1]
-    assert not jm.steadiness([long, jm.Recording(forces(3, 15.0)[1], RATE)]).notices
+    assert "the trials last 9 s to 15 s" in jm.data.steadiness([long, short]).notices[-1]
+    assert not jm.data.steadiness([long, jm.Recording(forces(3, 15.0)[1], RATE)]).notices
 
 
 def test_a_window_with_a_ramp_is_noticed():
@@ -407,17 +415,17 @@ def test_a_window_with_a_ramp_is_noticed():
     x = np.concatenate([np.zeros(200), np.linspace(0, LEVEL, 200), forces(1, 15.0)[0]])
     whole = jm.Recording(x, RATE, name="whole")
     for recording in (whole, whole.steady((2.5, 19.0))):
-        (said,) = (notice for notice in jm.steadiness(recording).notices if "ramp" in notice)
+        (said,) = (notice for notice in jm.data.steadiness(recording).notices if "ramp" in notice)
         assert said.startswith("the level goes from ") and f"{LEVEL:.0f}" in said.split(" to ")[1]
         assert said in recording.target().notices
-    assert not noticed(jm.steadiness(whole.steady()), "ramp counts")
+    assert not noticed(jm.data.steadiness(whole.steady()), "ramp counts")
     # a limb may move
-    assert not noticed(jm.steadiness(jm.Recording(x, RATE, unit="mm")), "level goes")
+    assert not noticed(jm.data.steadiness(jm.Recording(x, RATE, unit="mm")), "level goes")
 
 
 def test_a_unit_that_says_nothing_is_noticed():
     """An EMG that was taken by mistake looks as any signal does."""
-    said = jm.steadiness(jm.Recording(forces(1, 15.0)[0], RATE, unit="mV")).notices
+    said = jm.data.steadiness(jm.Recording(forces(1, 15.0)[0], RATE, unit="mV")).notices
     assert said[0].startswith("the unit mV does not say what was measured: is it the right column?")
 
 
@@ -432,7 +440,7 @@ def test_trials_that_agree_by_chance_are_noticed():
         for row in draws
     ]
     assert scipy.stats.binomtest(sum(found), 4000, 0.01).pvalue > 1e-4
-    one = jm.steadiness(
+    one = jm.data.steadiness(
         [jm.Recording(LEVEL + k + forces(1, 15.0)[0], RATE, name=f"{k}") for k in (0.0, 0.1, 0.2)]
     )
     (said,) = (notice for notice in one.notices if "agree much better" in notice)
@@ -446,14 +454,16 @@ def test_trials_that_are_no_trials_of_one_condition_are_noticed():
     )
     strong = jm.Recording(3 * second.samples, RATE, name="strong")
     twice = jm.Recording(first.samples, RATE, name="again")
-    notices = jm.steadiness([first, strong]).notices
+    notices = jm.data.steadiness([first, strong]).notices
     low, high = (f"{np.mean(r.filtered()):.4g} {r.unit}" for r in (first, strong))
     assert notices[0].startswith(
         f"the means of the trials reach from {low} (a) to {high} (strong): are they of one"
         " condition"
     )
     assert "three or more" in notices[1]
-    assert "a and again hold the same numbers" in jm.steadiness([first, twice, second]).notices[0]
+    assert (
+        "a and again hold the same numbers" in jm.data.steadiness([first, twice, second]).notices[0]
+    )
     assert any(
         "a and again hold the same numbers" in notice
         for notice in jm.data.Trials([first, twice]).target().notices
@@ -539,7 +549,7 @@ def expected_interval(name, m, count, segments):
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_every_error_has_the_interval_of_its_law(count, found):
-    one = found if count == 3 else jm.steadiness(trials()[:count])
+    one = found if count == 3 else jm.data.steadiness(trials()[:count])
     segments = [recording.segments() for recording in trials()]
     for name, m in one.measures.items():
         if name in ("tremor_p", "tremor_detectable"):
@@ -609,7 +619,7 @@ def test_intervals_by_scatter_are_cut_where_no_value_can_lie():
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_what_is_printed_is_what_is_saved(count, found):
-    one = found if count == 3 else jm.steadiness(trials()[0])
+    one = found if count == 3 else jm.data.steadiness(trials()[0])
     rows = re.findall(r"(\S+) ± (\S+)(?: N| %| Hz)? +(\S+) to (\S+)$", str(one), re.MULTILINE)
     bands = [f"{kind}{name}" for kind in ("relative_power", "share") for name in RANGES]
     tremor = ["tremor_frequency", "tremor_size"]

@@ -120,7 +120,7 @@ def test_every_way_to_read_a_file_can_be_stated(where, exported):
     table = read_study(study)
     found = cells_of_study(table.rows, {"window": "all"} | table.options)
     for cell in found:
-        same = jm.Trials([jm.load_recording(exported / f"{cell.person}1.csv", **OPTIONS)])
+        same = jm.data.Trials([jm.load_recording(exported / f"{cell.person}1.csv", **OPTIONS)])
         wanted = same.target(cell.person, mvc=50.0, settings="slow")
         assert (
             cell.target.settings == wanted.settings

@@ -44,14 +44,14 @@ def trials(rng, count=5, spread=0.0, drift=0.0):
         signal(rng, 0.8 * np.exp(spread * rng.normal()), 3.0 * np.exp(drift * rng.normal()))
         for _ in range(count)
     ]
-    return jm.Trials([jm.Recording(x, RATE, name=f"anna_{i}") for i, x in enumerate(made)])
+    return jm.data.Trials([jm.Recording(x, RATE, name=f"anna_{i}") for i, x in enumerate(made)])
 
 
 def test_absolute_spectra_are_averaged_with_their_segments():
     """Against Welch's method by scipy on each trial, weighted with the segments that one counts by
     hand."""
     rng = np.random.default_rng(0)
-    both = jm.Trials(
+    both = jm.data.Trials(
         [
             jm.Recording(signal(rng, sd, seconds=s), RATE, name=f"t{s:g}")
             for sd, s in ((1.0, 10.0), (2.0, 20.0))
@@ -84,7 +84,7 @@ def test_what_several_trials_say_is_said_once():
         np.concatenate([rest, rise, signal(rng, seconds=s), rise[::-1]]) for s in (10.0, 12.0, 14.0)
     ]
     said = [("taken as N", "cut off"), ("taken as N",), ("taken as N", "cut off")]
-    found = jm.Trials(
+    found = jm.data.Trials(
         jm.Recording(x, RATE, name=f"t{i}", notices=own)
         for i, (x, own) in enumerate(zip(held, said, strict=True))
     ).steady()
@@ -290,9 +290,9 @@ def test_different_units_are_refused():
     with pytest.raises(
         ValueError, match=r"units N and mN cannot be averaged; bring all trials to one unit"
     ):
-        jm.Trials([jm.Recording(x, RATE), jm.Recording(x, RATE, unit="mN")])
+        jm.data.Trials([jm.Recording(x, RATE), jm.Recording(x, RATE, unit="mN")])
     with pytest.raises(ValueError, match="give at least one"):
-        jm.Trials([])
+        jm.data.Trials([])
 
 
 BAD = {
@@ -343,10 +343,10 @@ def test_whatever_is_data_becomes_a_target(tmp_path):
     rng = np.random.default_rng(8)
     paths = [write(tmp_path / f"t{i}.csv", signal(rng)) for i in range(2)]
     recordings = [jm.load_recording(path).steady() for path in paths]
-    wanted = jm.Trials(recordings).target()
+    wanted = jm.data.Trials(recordings).target()
     for given in (
         wanted,
-        jm.Trials(recordings),
+        jm.data.Trials(recordings),
         recordings,
         tuple(recordings),
         paths,
@@ -488,7 +488,7 @@ def test_a_fit_has_the_measured_mean(strong):
         "P_w" in result.free and result.settings["mean_force"] is not None and not result.per_newton
     )
     assert result.task["m_w"] > 5 * jm.Isometric()["m_w"]
-    target = jm.Trials(found).target()
+    target = jm.data.Trials(found).target()
     assert result.settings["carried"] == pytest.approx(result.task["m_w"] / jm.Isometric()["m_w"])
     said = " ".join(result.details().split())
     assert "the muscle has the measured mean force" in said
@@ -510,7 +510,7 @@ def test_a_fit_has_the_measured_mean(strong):
 
 def test_a_fit_of_recordings_keeps_what_was_measured(strong, tmp_path):
     found, result = strong
-    wanted = {name: m.row() for name, m in jm.steadiness(found).measures.items()}
+    wanted = {name: m.row() for name, m in jm.data.steadiness(found).measures.items()}
     result.save(tmp_path / "fit.json")
     for kept in (result, jm.load_result(tmp_path / "fit.json")):
         np.testing.assert_equal({name: m.row() for name, m in kept.measured.items()}, wanted)

@@ -205,7 +205,7 @@ def test_an_angular_velocity_has_a_tremor_and_no_level(name, tmp_path):
     x = 20 + 5 * np.sin(2 * np.pi * 4.4 * t + np.cumsum(0.05 * rng.normal(size=t.size)))
     found = jm.load_recording(write(tmp_path, name, x + rng.normal(size=t.size)))
     assert found.quantity == "angular velocity"
-    steady = jm.steadiness(found.steady())
+    steady = jm.data.steadiness(found.steady())
     assert steady.band == (3.0, 20.0)
     assert steady["tremor_frequency"].value == pytest.approx(4.4, abs=0.2)
     assert math.isnan(steady["coefficient_of_variation"].value)
@@ -220,7 +220,7 @@ def test_gravity_is_no_level(unit, scale):
     rng, t = np.random.default_rng(2), np.arange(3000) / RATE
     phase = 2 * np.pi * 5.2 * t + np.cumsum(0.05 * rng.normal(size=t.size))
     x = scale * (1 + 0.05 * np.sin(phase) + 0.005 * rng.normal(size=t.size))
-    found = jm.steadiness(jm.Recording(x, RATE, unit=unit))
+    found = jm.data.steadiness(jm.Recording(x, RATE, unit=unit))
     names = ("coefficient_of_variation", "relative_power_4_8")
     assert all(math.isnan(found[name].value) for name in names)
     assert noticed(found, "gravity and offset of the sensor")
@@ -234,7 +234,7 @@ def test_a_tremor_that_is_nearly_all_is_seen(frequency, unit):
     rng, t = np.random.default_rng(5), np.arange(6000) / RATE
     slow = np.cumsum(rng.normal(size=t.size)) * 0.02
     x = np.sin(2 * np.pi * frequency * t + slow) + 0.02 * rng.normal(size=t.size)
-    found = jm.steadiness(jm.Recording(x, RATE, unit=unit).steady())
+    found = jm.data.steadiness(jm.Recording(x, RATE, unit=unit).steady())
     assert found["tremor_frequency"].value == pytest.approx(frequency, abs=0.1)
     assert found["tremor_p"].value <= 0.001
 
@@ -246,7 +246,7 @@ def test_slow_recordings_have_a_steadiness(rate):
     x = 40 + np.convolve(rng.normal(size=t.size + 40), np.ones(41) / 20, "valid")
     x += 0.3 * np.sin(2 * np.pi * 7 * t + np.cumsum(rng.normal(size=t.size)) * 0.05)
     recording = jm.Recording(x, rate).steady()
-    found = jm.steadiness(recording)
+    found = jm.data.steadiness(recording)
     left_out = rate < 24
     assert math.isnan(found["power_8_12"].value) == left_out
     assert math.isnan(found["share_above_12"].value) == left_out
@@ -262,18 +262,18 @@ def test_slow_recordings_have_a_steadiness(rate):
 
 def test_a_hold_without_tremor_band_says_so():
     x = 40 + np.random.default_rng(7).normal(size=600)
-    found = jm.steadiness(jm.Recording(x, 12))
+    found = jm.data.steadiness(jm.Recording(x, 12))
     assert math.isnan(found["tremor_p"].value)
     assert "a tremor was not looked for" in found.notices[-1]
 
 
 def test_the_level_over_the_mvc(tmp_path):
-    one = jm.steadiness(jm.Recording(X, RATE), mvc=400)
+    one = jm.data.steadiness(jm.Recording(X, RATE), mvc=400)
     assert one["level"].value == pytest.approx(np.mean(X) / 400, rel=1e-3)
     assert "\n  over the MVC              9.9" in str(one)
-    assert "level" not in jm.steadiness(jm.Recording(X, RATE)).measures
+    assert "level" not in jm.data.steadiness(jm.Recording(X, RATE)).measures
     with pytest.raises(ValueError, match="mvc=30: give a force above the mean"):
-        jm.steadiness(jm.Recording(X, RATE), mvc=30)
+        jm.data.steadiness(jm.Recording(X, RATE), mvc=30)
 
 
 @pytest.mark.parametrize(("size", "moved"), [(1.5, True), (0.01, False)])
@@ -287,7 +287,7 @@ def test_analyse_says_that_a_record_is_moved(size, moved, tmp_path):
     assert ("angle_deg rests" in notice) == (not moved)
     if moved:
         both = jm.load_recording(path, force="torque_Nm", displacement="angle_deg", lever_arm=0.1)
-        assert isinstance(both, jm.PerturbedRecording)
+        assert isinstance(both, jm.data.PerturbedRecording)
 
 
 def test_a_moved_record_needs_the_unit_of_the_force(tmp_path):

@@ -201,7 +201,7 @@ def test_where_nothing_is_left_nothing_is_said():
 
 
 def test_points_of_a_sweep_are_single_ensembles():
-    sweep = jm.Sweep.grid(TASK, k_w=[4e5, 6e5], noise_K_w=[0.1, 0.2, 0.3])
+    sweep = jm.ensembles.Sweep.grid(TASK, k_w=[4e5, 6e5], noise_K_w=[0.1, 0.2, 0.3])
     assert len(sweep) == 6 and sweep[1]["noise_K_w"] == 0.2 and sweep[5]["k_w"] == 6e5
     runs = jm.ensemble(sweep, KEY, seeds=3, duration=1.0)
     single = jm.ensemble(sweep[4], KEY, seeds=3, duration=1.0)
@@ -215,7 +215,7 @@ def test_points_of_a_sweep_are_single_ensembles():
 @pytest.mark.parametrize("seeds, chunk", [(2, 8), (20, 8)])
 def test_a_reduced_sweep_has_the_moments_of_every_point(seeds, chunk):
     """With few seeds of many points at once, and with many seeds of a point in pieces."""
-    sweep = jm.Sweep.design(TASK, {"k_w": [4e5, 5e5, 6e5, 7e5, 8e5]})
+    sweep = jm.ensembles.Sweep.design(TASK, {"k_w": [4e5, 5e5, 6e5, 7e5, 8e5]})
     found = jm.ensemble(sweep, KEY, seeds=seeds, reduce=True, duration=1.0, chunk=chunk)
     assert found.mean.shape == (5, 101) and found.quantile.shape == (5, 5, 101)
     for point in (0, 4):
@@ -229,7 +229,9 @@ def test_a_reduced_sweep_has_the_moments_of_every_point(seeds, chunk):
 
 
 def test_persons_differ_in_numbers_only():
-    persons = jm.Sweep.of([TASK, TASK.replace(m_w=0.3, c_w=90.0)], names=["first", "second"])
+    persons = jm.ensembles.Sweep.of(
+        [TASK, TASK.replace(m_w=0.3, c_w=90.0)], names=["first", "second"]
+    )
     assert set(persons.labels) == {"name", "m_w", "c_w"}
     stiff = [TASK, TASK.replace(c_w=400.0)]  # the faster one asks for sub-steps
     runs = jm.ensemble(stiff, KEY, seeds=2, duration=1.0)
@@ -242,12 +244,12 @@ def test_persons_differ_in_numbers_only():
     with pytest.raises(
         ValueError, match=r"task 1 of the sweep differs from task 0 in more than numbers.*PinkNoise"
     ):
-        jm.Sweep.of([TASK, jm.Isometric(noise=jm.PinkNoise())])
+        jm.ensembles.Sweep.of([TASK, jm.Isometric(noise=jm.PinkNoise())])
 
 
 def test_draws_of_any_shape_make_a_design():
     draws = {"k_w": np.full((2, 3), 4e5), "c_z": np.arange(1.0, 7.0).reshape(2, 3)}
-    sweep = jm.Sweep.design(TASK, draws)
+    sweep = jm.ensembles.Sweep.design(TASK, draws)
     assert (
         len(sweep) == 6
         and sweep[3]["c_z"] == 4.0
@@ -258,15 +260,21 @@ def test_draws_of_any_shape_make_a_design():
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: jm.Sweep.of([]), "at least one task"),
-        (lambda: jm.Sweep.design(TASK, {}), "columns of one length"),
-        (lambda: jm.Sweep.design(TASK, {"k_w": [1e5, 2e5], "c_w": [1.0]}), "columns of one length"),
+        (lambda: jm.ensembles.Sweep.of([]), "at least one task"),
+        (lambda: jm.ensembles.Sweep.design(TASK, {}), "columns of one length"),
         (
-            lambda: jm.Sweep.design(TASK, {"k_w": [4e5, -1.0]}),
+            lambda: jm.ensembles.Sweep.design(TASK, {"k_w": [1e5, 2e5], "c_w": [1.0]}),
+            "columns of one length",
+        ),
+        (
+            lambda: jm.ensembles.Sweep.design(TASK, {"k_w": [4e5, -1.0]}),
             "k_w = -1 at point 1 is outside its range, 0 or more",
         ),
-        (lambda: jm.Sweep.design(TASK, {"k_v": [4e5]}), "unknown parameter 'k_v'"),
-        (lambda: jm.Sweep.of([TASK], names=["a", "b"]), "names has 2 entries for 1 tasks"),
+        (lambda: jm.ensembles.Sweep.design(TASK, {"k_v": [4e5]}), "unknown parameter 'k_v'"),
+        (
+            lambda: jm.ensembles.Sweep.of([TASK], names=["a", "b"]),
+            "names has 2 entries for 1 tasks",
+        ),
         (lambda: jm.ensemble(TASK, KEY, seeds=0), "seeds = 0"),
         (lambda: jm.ensemble(TASK, KEY, seeds=-3), "seeds = -3: give at least one seed"),
         (lambda: jm.ensemble(TASK, KEY, seeds=1, chunk=0), "chunk = 0"),
@@ -309,7 +317,7 @@ def test_a_store_holds_what_memory_would(tmp_path):
 
 
 def test_a_store_of_a_sweep_has_points(tmp_path):
-    sweep = jm.Sweep.grid(TASK, k_w=[4e5, 5e5, 6e5])
+    sweep = jm.ensembles.Sweep.grid(TASK, k_w=[4e5, 5e5, 6e5])
     for name, seeds in (("few", 2), ("many", 20)):
         dataset = jm.ensemble(sweep, KEY, seeds=seeds, store=tmp_path / name, **SHORT)
         assert dict(dataset.sizes) == {"point": 3, "seed": seeds, "time": 101}
@@ -566,7 +574,7 @@ def test_threads_change_nothing(tmp_path, monkeypatch, threads):
     and in double precision."""
     given = {"seeds": 45, **SHORT}
     sweep = {"seeds": 11, "duration": 1.0, "chunk": 8}
-    points = jm.Sweep.grid(TASK, k_w=[4e5, 5e5])
+    points = jm.ensembles.Sweep.grid(TASK, k_w=[4e5, 5e5])
     whole, alone = (
         jm.ensemble(TASK, KEY, threads=1, **given),
         jm.ensemble(TASK, KEY, reduce=True, threads=1, **given),
@@ -638,7 +646,8 @@ _batch.THREADED = ()
 key, task = jax.random.key(5), jm.Isometric()
 assert _batch.local_mesh().size == 3
 runs = jm.ensemble(task, key, seeds=20, duration=1.0)
-sweep = jm.ensemble(jm.Sweep.grid(task, k_w=[4e5, 5e5, 6e5, 7e5, 8e5]), key, seeds=2, duration=1.0)
+sweep = jm.ensembles.Sweep.grid(task, k_w=[4e5, 5e5, 6e5, 7e5, 8e5])
+sweep = jm.ensemble(sweep, key, seeds=2, duration=1.0)
 path = {str(tmp_path / "a.zarr")!r}
 store = jm.ensemble(task, key, seeds=45, store=path, resume=True, duration=1.0)
 sweep = np.stack([m.output for m in sweep])

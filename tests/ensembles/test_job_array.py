@@ -134,7 +134,7 @@ def test_merged_spectra_are_those_of_one_run(tmp_path):
 
 @pytest.mark.parametrize("seeds", [2, 20], ids=["points together", "points in pieces"])
 def test_parts_of_a_sweep(tmp_path, seeds):
-    sweep = jm.Sweep.grid(TASK, k_w=[4e5, 5e5, 6e5, 7e5, 8e5])
+    sweep = jm.ensembles.Sweep.grid(TASK, k_w=[4e5, 5e5, 6e5, 7e5, 8e5])
     given: Any = {"seeds": seeds, "reduce": True, **SHORT}
     for number in (2, 3, 1):
         jm.ensemble(sweep, KEY, store=tmp_path / "a.zarr", part=(number, 3), **given)

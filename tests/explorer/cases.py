@@ -59,7 +59,7 @@ STRUCTURES: dict[str, Any] = {
         noise=jm.BandLimitedNoise((20.0, 2.0, 1.0, 0.5), relative=False)
     ),
     "isometric shared": jm.Isometric(noise=SHARED, activation=jm.Activation()),
-    "isometric richest": jm.on_rung(jm.Isometric(), 3),
+    "isometric richest": jm.model.on_rung(jm.Isometric(), 3),
     "isometric drive": jm.Isometric(noise=BOTH, activation=jm.Activation()),
     "isometric average": jm.Isometric(
         noise=OU, settings=Q(sampling="average", filter_direction="both")

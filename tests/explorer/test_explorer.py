@@ -124,7 +124,7 @@ def test_the_modules_can_be_joined():
 def test_every_parameter_has_a_slider_in_its_bounds():
     rows, text = facts()["parameters"], part_of("controls.mjs")
     for name, row in rows.items():
-        known = jm.PARAMETERS[name]
+        known = jm.model.PARAMETERS[name]
         assert f'"{name}"' in text
         assert max(known.lower, known.fit_lower) <= row["low"] < known.default < row["high"] <= min(
             known.upper, known.fit_upper

@@ -648,7 +648,7 @@ def test_bad_arguments_are_named(arguments, message):
     "function, given, message",
     [
         (jm.fit, "metod", "did you mean 'method'"),
-        (jm.problem, "starts", "known are bounds"),
+        (jm.fits.problem, "starts", "known are bounds"),
     ],
 )
 def test_an_unknown_option_is_named_with_the_nearest(function, given, message):
@@ -1156,5 +1156,7 @@ def test_a_start_that_is_left_behind_ends_sooner():
 
 def test_a_task_that_is_traced_is_refused_with_a_way_out():
     target = jm.load_target("vastus-lateralis-26mvc")
-    with pytest.raises(ValueError, match=r"JAX is tracing it.*Call fit outside; jaxmuscle.problem"):
+    with pytest.raises(
+        ValueError, match=r"JAX is tracing it.*Call fit outside; jaxmuscle.fits.problem"
+    ):
         jax.jit(lambda k_w: jm.fit(jm.Isometric().replace(k_w=k_w), target).chi2_per_bin)(4e5)

@@ -176,7 +176,7 @@ def test_an_interval_ends_where_the_profile_does(task, segments, x64):
 
 
 def test_the_level_is_zero_at_the_half_power_frequency(x64):
-    for task in (STEEP, BENT, SHELF, jm.on_rung(STEEP, 1)):
+    for task in (STEEP, BENT, SHELF, jm.model.on_rung(STEEP, 1)):
         at, below, above = level_at(task, frequency_of(task) * np.exp([0.0, -0.1, 0.1]))
         # One Newton step from a grid of 3 %: what it leaves is of the order of 3 % squared.
         assert abs(at) < 1e-3

@@ -283,10 +283,7 @@ def test_the_joint_problem_is_its_parts(x64):
         assert not np.any(np.delete(seen.slopes[i].power, own, axis=-1))
     here = seen.row(0)
     residuals = np.asarray(objective.residuals(jnp.asarray(theta[0]), here.moments, objective.data))
-    parts = [
-        data_residuals(p.residual, m, p.data)
-        for p, m in zip(objective.parts, here.moments, strict=True)
-    ]
+    parts = [data_residuals(m, p.data) for p, m in zip(objective.parts, here.moments, strict=True)]
     np.testing.assert_allclose(residuals, np.concatenate([*parts, theta[0]]))
 
 
@@ -328,7 +325,7 @@ def test_proportional_parameters_keep_the_ratio_of_their_tasks(x64):
         "noise_C_z",
         "harmonic_amplitude",
     )
-    tasks = {f"{100 * level:g}": jm.at_level(TRUTH, level) for level in (0.15, 0.6)}
+    tasks = {f"{100 * level:g}": jm.response.at_level(TRUTH, level) for level in (0.15, 0.6)}
     targets = {name: expected(task) for name, task in tasks.items()}
     problem = planned(targets, tasks, proportional=names).problem
     assert problem.coordinates.names == DEFAULT_FREE
@@ -581,7 +578,6 @@ SHIFT = jm.Target("shift", 1 / np.arange(1.0, 31.0), segments=12, quantity="disp
             "priors: unknown or not free parameter 'k_w@a'",
         ),
         ({"a": A, "b": B}, {"starts": 0}, "starts = 0: give a whole number from 1"),
-        ({"a": A, "b": B}, {"residual": "square"}, "residual = 'square'"),
     ],
 )
 def test_bad_arguments(targets, options, message):
@@ -613,7 +609,7 @@ def test_two_targets_climb_together_and_their_aic_is_that_of_both(x64):
     both."""
     rng, truth = (
         np.random.default_rng(4),
-        jm.on_rung(jm.Isometric(), 2).replace(resonance_amplitude=0.3),
+        jm.model.on_rung(jm.Isometric(), 2).replace(resonance_amplitude=0.3),
     )
     power = np.asarray(jm.expected_spectrum(truth).proportional)
     pair = {
@@ -625,7 +621,9 @@ def test_two_targets_climb_together_and_their_aic_is_that_of_both(x64):
     numbers = [rung.number for rung in found.ladder]
     assert numbers == [2] and found.adequate  # a tremor is seen
     (rung,) = found.ladder
-    height = sum(float(jm.log_likelihood(part.task, part.target)) for part in found.parts.values())
+    height = sum(
+        float(jm.objective.log_likelihood(part.task, part.target)) for part in found.parts.values()
+    )
     assert rung.aic == pytest.approx(2 * rung.parameters - 2 * height, abs=0.05)
     assert abs(found["resonance_frequency"].value - float(truth["resonance_frequency"])) < 1.0
     assert "the spectrum shows a tremor" in " ".join(found.details().split())

@@ -33,7 +33,7 @@ def response(seed=0, segments=40):
         true = np.asarray(jm.response.dynamic_stiffness(TASK, F))
     sd = 0.02 * np.abs(true)
     noise = np.random.default_rng(seed).standard_normal((2, F.size))
-    return jm.FrequencyResponse(F, true + sd * (noise[0] + 1j * noise[1]), sd, name="figure")
+    return jm.data.FrequencyResponse(F, true + sd * (noise[0] + 1j * noise[1]), sd, name="figure")
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_a_response_alone_knows_no_noise_that_would_limit_a_further_measurement(
         str(report).split()
     )
     with pytest.raises(ValueError, match=r"result: no further measurement is tried.*fit_joint"):
-        jm.design_input(result)
+        jm.uncertainty.design_input(result)
 
 
 def test_a_tangent_stiffness_far_from_the_lowest_measured_one_is_called_extrapolated(fitted):
@@ -108,7 +108,7 @@ def test_a_response_alone_is_fitted_from_the_command_line(fitted):
     np.testing.assert_allclose(
         table["fitted_real"] + 1j * table["fitted_imaginary"], own, rtol=1e-6
     )
-    again = jm.load_frequency_response(folder / "stiffness.csv")  # which can be fitted alone
+    again = jm.data.load_frequency_response(folder / "stiffness.csv")  # which can be fitted alone
     np.testing.assert_allclose(again.value, given.value, rtol=1e-7)
     np.testing.assert_allclose(again.stderr, given.stderr, rtol=1e-7)
     assert again.name == "stiffness"
@@ -152,7 +152,7 @@ def test_goodness_of_a_response_has_the_law_of_least_squares():
     """Three numbers that it determines are free: what a replicate's fit leaves is chi² of so many
     degrees fewer."""
     fit = jm.fit(TASK, jm.Target("figure", None, stiffness=response()), free=THREE, starts=8)
-    found = jm.goodness(fit, replicates=499)
+    found = jm.checks.goodness(fit, replicates=499)
     assert set(found.observed) == set(found.reference) == {"chi2_per_point", "largest_point"}
     rest = scipy.stats.chi2(2 * F.size - len(THREE))
     assert (
@@ -176,9 +176,9 @@ def test_goodness_finds_the_point_that_is_off():
     true = response()
     value = true.value.copy()
     value[5] += 8 * true.stderr[5]
-    odd = jm.FrequencyResponse(F, value, true.stderr, name="figure")
+    odd = jm.data.FrequencyResponse(F, value, true.stderr, name="figure")
     fit = jm.fit(TASK, jm.Target("figure", None, stiffness=odd), free=THREE, starts=8)
-    found = jm.goodness(fit, replicates=499)
+    found = jm.checks.goodness(fit, replicates=499)
     assert found.p_values["largest_point"] == 1 / 500
     words = " ".join(str(found).split())
     assert re.search(
@@ -363,7 +363,10 @@ def test_one_model_of_the_ladder_is_fitted_with_a_hold(tmp_path, monkeypatch):
         assert "enough" in CliRunner().invoke(app, [*given, *rung]).stderr
         assert seen["rungs"] == rungs
         assert seen.get("tasks") == (
-            {"moved": jm.on_rung(jm.PrescribedLength(), 2), "held": jm.on_rung(jm.Isometric(), 2)}
+            {
+                "moved": jm.model.on_rung(jm.PrescribedLength(), 2),
+                "held": jm.model.on_rung(jm.Isometric(), 2),
+            }
             if rungs == 0
             else None
         )
@@ -423,7 +426,7 @@ def test_the_answer_of_a_light_and_damped_muscle_is_taken_off_whole(monkeypatch)
     with jax.enable_x64(True):
         answer = driven(task, -motion, 1 / rate)
     noise = 0.005 * rng.standard_normal(answer.size)
-    recording = jm.PerturbedRecording.from_array(
+    recording = jm.data.PerturbedRecording.from_array(
         55.0 + answer + noise, motion[0, ::2], rate / 2, positive="lengthening"
     )
     with jax.enable_x64(True):
@@ -463,7 +466,7 @@ def specimen(seed, answer=None):
         np.fft.irfft(np.fft.rfft(x) * IN_SERIES, LENGTH) if answer is None else answer(x)
     )
     return (
-        jm.PerturbedRecording.from_array(force, x, RATE, positive="lengthening").steady(
+        jm.data.PerturbedRecording.from_array(force, x, RATE, positive="lengthening").steady(
             (3.0, 63.0)
         ),
         own,
@@ -529,7 +532,7 @@ def test_fluctuations_of_another_origin_do_not_hide_the_answer_from_the_search()
     ends in a wrong muscle."""
     recording, _ = specimen(5)
     with without_intervals():
-        result = jm.fit(jm.on_rung(TASK, 1), recording, starts=16, seeds=0, check_seeds=0)
+        result = jm.fit(jm.model.on_rung(TASK, 1), recording, starts=16, seeds=0, check_seeds=0)
     for name, true in {
         "K_w_tangent": 2000,
         "K_z0": 4000,

@@ -25,7 +25,7 @@ def x64():
 
 @pytest.fixture(scope="module")
 def problem():
-    return jm.problem(TASK, TARGET)
+    return jm.fits.problem(TASK, TARGET)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,9 @@ def test_coordinates_and_parameters(problem):
 def test_values_are_traced_on_their_way_to_theta_and_exact_beside_a_bound():
     """A log density of parameters in their units, as `problem.theta` under `jit` and `grad` makes
     it."""
-    problem = jm.problem(TASK, TARGET, free=("k_w", "x_z", "harmonic_frequency"), bounds=BOUNDS)
+    problem = jm.fits.problem(
+        TASK, TARGET, free=("k_w", "x_z", "harmonic_frequency"), bounds=BOUNDS
+    )
     start = {name: float(TASK[name]) for name in problem.names}
     back = kept_jit(lambda values: problem.parameters(problem.theta(values)))
     for values in (
@@ -83,7 +85,7 @@ def test_the_prior_is_a_density_of_the_coordinates(problem):
     """`ln N(z) + ln |dz/dθ|` with z the distance from the prior's centre in its standard
     deviations, from the parameters."""
     theta = problem.theta({"k_w": 3e5, "harmonic_frequency": 7.0, "noise_K_z": 0.02})
-    sds = np.array([jm.PARAMETERS[name].prior_sd for name in problem.names])
+    sds = np.array([jm.model.PARAMETERS[name].prior_sd for name in problem.names])
 
     def z(theta):
         values = problem.parameters(theta)
@@ -105,9 +107,12 @@ def test_log_density_and_its_slope(problem):
     theta = problem.theta({"c_w": 90.0, "harmonic_frequency": 7.0})
     # its law is the same everywhere
     bare = jm.Target("spectrum alone", TARGET.proportional_power, segments=TARGET.segments)
-    alone = jm.problem(TASK, bare)
+    alone = jm.fits.problem(TASK, bare)
     ours = float(alone.log_likelihood(theta) - alone.log_likelihood(alone.start))
-    theirs = float(jm.log_likelihood(alone.task(theta), bare) - jm.log_likelihood(TASK, bare))
+    theirs = float(
+        jm.objective.log_likelihood(alone.task(theta), bare)
+        - jm.objective.log_likelihood(TASK, bare)
+    )
     assert ours == pytest.approx(theirs, abs=1e-6)
     steps = 1e-5 * np.concatenate(
         [np.eye(len(theta)), -np.eye(len(theta)), np.zeros((1, len(theta)))]
@@ -129,7 +134,7 @@ def test_log_density_and_its_slope(problem):
 def test_the_log_density_has_second_derivatives():
     """Against differences of the slope, in a step so small that the ripple along the frequency does
     not show."""
-    problem = jm.problem(TASK, TARGET, free=("c_w", "noise_K_w", "harmonic_frequency"))
+    problem = jm.fits.problem(TASK, TARGET, free=("c_w", "noise_K_w", "harmonic_frequency"))
     theta, step = problem.theta({"c_w": 90.0, "harmonic_frequency": 7.0}), 1e-6 * np.eye(3)
     points = theta + np.concatenate([np.zeros((3, 3)), step, -step])
 
@@ -179,9 +184,10 @@ def test_bounds_are_counted_in_standard_deviations_of_the_prior():
 def test_the_log_likelihood_is_that_of_the_task_but_for_the_variation():
     """A coefficient of variation scatters as at the start; without one the two are the same."""
     target = jm.Target("a", TARGET.proportional_power, segments=12)
-    problem = jm.problem(TASK, target, free=("k_w", "c_w", "noise_K_z"))
+    problem = jm.fits.problem(TASK, target, free=("k_w", "c_w", "noise_K_z"))
     off = [
-        float(problem.log_likelihood(theta)) - float(jm.log_likelihood(problem.task(theta), target))
+        float(problem.log_likelihood(theta))
+        - float(jm.objective.log_likelihood(problem.task(theta), target))
         for theta in np.array([[0.0, 0, 0], [1, 1, -1], [-1, 0.5, 0.5]])
     ]
     np.testing.assert_allclose(off, off[0], atol=1e-8)
@@ -210,7 +216,7 @@ def test_scipy_finds_the_minimum_of_the_fit(problem, result):
 
 
 def test_a_target_without_scatter_has_residuals_but_no_density():
-    bare = jm.problem(TASK, jm.Target("bare", TARGET.proportional_power))
+    bare = jm.fits.problem(TASK, jm.Target("bare", TARGET.proportional_power))
     assert np.all(np.isfinite(bare.residuals(bare.start)))
     with pytest.raises(ValueError, match="states neither segments nor sigma"):
         bare.log_density(bare.start)
@@ -226,7 +232,7 @@ def test_results_summarise_themselves(result):
     assert html.count(">measured<") == len(result.measured) and ">determined<" in html
 
 
-class Network(jm.AbstractMuscle):
+class Network(jm.model.AbstractMuscle):
     """A linear muscle whose stiffness a small network changes."""
 
     stiffness: float = 300.0

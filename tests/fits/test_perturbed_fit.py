@@ -94,7 +94,7 @@ def recorded(seed, rms=1e-3, top=5.0, line=0.0):
     low = scipy.signal.butter(4, top / (RATE / 2), output="sos")
     x = scipy.signal.sosfiltfilt(low, generator.normal(size=SECONDS * RATE + 4000))[2000:-2000]
     x *= rms / np.std(x)
-    return jm.PerturbedRecording.from_array(
+    return jm.data.PerturbedRecording.from_array(
         muscle_force(x, generator, line=line), -x, RATE, positive="lengthening", name="minute"
     )
 
@@ -180,7 +180,7 @@ def test_further_questions_take_it(result):
     profile = jm.profile(result, "k_z", with_priors=True)  # that of m_w counts in the interval
     low, high = result["k_z"].interval
     np.testing.assert_allclose((profile.low, profile.high), (low, high), rtol=0.02)
-    checked = jm.goodness(result, replicates=99)
+    checked = jm.checks.goodness(result, replicates=99)
     assert checked.p_value > 0.01  # the least that 99 replicates can give, if none is as far off
     assert set(checked.observed) == {
         "chi2_per_bin",
@@ -306,7 +306,7 @@ def test_the_estimate_of_the_stiffness_is_not_biased(minute):
 
 
 def test_a_window_needs_what_lies_before_it(minute):
-    short = jm.PerturbedRecording.from_array(
+    short = jm.data.PerturbedRecording.from_array(
         minute.force.whole[: 9 * RATE],
         minute.displacement.whole[: 9 * RATE],
         RATE,
@@ -320,7 +320,7 @@ def test_a_window_needs_what_lies_before_it(minute):
 
 def test_a_window_that_is_cut_says_so(minute):
     whole = minute.force.whole.size / RATE
-    cut = jm.PerturbedRecording.from_array(
+    cut = jm.data.PerturbedRecording.from_array(
         minute.force.whole,
         minute.displacement.whole,
         RATE,
@@ -331,7 +331,7 @@ def test_a_window_that_is_cut_says_so(minute):
         f"of the window from 20 to {whole:.4g} s the fit uses 20 to {whole - 2:.4g} s: it needs 2 s"
     )
     assert any(notice.startswith(asked) for notice in cut.notices)
-    inside = jm.PerturbedRecording.from_array(
+    inside = jm.data.PerturbedRecording.from_array(
         minute.force.whole,
         minute.displacement.whole,
         RATE,
@@ -354,7 +354,7 @@ def test_a_displacement_that_moved_nothing(minute, tmp_path):
     """The right force beside a motion of another time: neither a fit nor one trial of several takes
     it."""
     force, moved = minute.force.whole, np.roll(minute.displacement.whole, 20 * RATE)
-    wrong = jm.PerturbedRecording.from_array(force, moved, RATE, source="other.csv")
+    wrong = jm.data.PerturbedRecording.from_array(force, moved, RATE, source="other.csv")
     assert any("sign of the displacement is not found" in notice for notice in wrong.notices)
     with pytest.raises(
         ValueError,
@@ -401,7 +401,7 @@ def published():
     sd = np.abs(true) * np.sqrt((1 - coherence) / (2 * averages * coherence))
     seen = true + sd * (generator.normal(size=POINTS) + 1j * generator.normal(size=POINTS))
     phase = np.degrees(np.angle(seen))
-    return jm.FrequencyResponse.from_gain(
+    return jm.data.FrequencyResponse.from_gain(
         f, np.abs(seen), phase, coherence=coherence, segments=averages, name="published"
     )
 
@@ -447,7 +447,7 @@ def test_likelihood_of_a_stiffness(published):
     with jax.enable_x64(True):
 
         def height(k_z):
-            return jm.log_likelihood(task.replace(k_z=k_z), target)
+            return jm.objective.log_likelihood(task.replace(k_z=k_z), target)
 
         model = np.asarray(jm.response.dynamic_stiffness(task, published.frequency))
         z = (model - published.value) / published.stderr
@@ -510,7 +510,9 @@ def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
         "m_z": 0.5,
         "activation_time": 0.05,
     }
-    muscle = jm.on_rung(jm.PrescribedLength(harmonic=jm.Harmonic(amplitude=0.0)), 1).replace(**true)
+    muscle = jm.model.on_rung(jm.PrescribedLength(harmonic=jm.Harmonic(amplitude=0.0)), 1).replace(
+        **true
+    )
     rate, time = 100, np.arange(90 * 100 + 1) / 100
     rng = np.random.default_rng(2)
     lines = np.concatenate([np.arange(28, 36), np.arange(170, 200)]) / 60
@@ -520,7 +522,7 @@ def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
     length *= 1e-3 / np.std(length)
     moved = jm.settled(muscle).with_parts(x_z=jm.model.Sampled.through(time, -length))
     force = np.asarray(jm.simulate(moved, 11, duration=90.0, rate=float(rate)).output)
-    record = jm.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0))
+    record = jm.data.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0))
     with without_intervals():
         fit = jm.fit(jm.PrescribedLength(), record, rungs=1, starts=8, seeds=0, check_seeds=0)
     assert fit.adequate and [rung.number for rung in fit.ladder if rung.chosen] == [1]

@@ -35,7 +35,7 @@ TREMOR = {"resonance_amplitude": 0.08, "resonance_frequency": 9.0, "resonance_wi
 
 def with_tremor() -> jm.Isometric:
     """A muscle with a twitch of 60 ms and a tremor at 9 Hz."""
-    return jm.on_rung(TASK, 2).replace(activation_time=0.06, **TREMOR)
+    return jm.model.on_rung(TASK, 2).replace(activation_time=0.06, **TREMOR)
 
 
 def drawn(power: np.ndarray, segments: int, seed: int) -> jm.Target:
@@ -59,7 +59,7 @@ def climbed() -> jm.fits.FitResult:
 @functools.cache
 def climbed_and_told() -> tuple[jm.fits.FitResult, list[tuple[str, float]]]:
     """Of a muscle with a slow twitch and no tremor, over many segments."""
-    task = jm.on_rung(TASK, 1).replace(activation_time=0.15, harmonic_amplitude=1e-4)
+    task = jm.model.on_rung(TASK, 1).replace(activation_time=0.15, harmonic_amplitude=1e-4)
     told: list[tuple[str, float]] = []
     result = jm.fit(
         TASK,
@@ -74,8 +74,8 @@ def climbed_and_told() -> tuple[jm.fits.FitResult, list[tuple[str, float]]]:
 
 
 def test_every_rung_adds_its_part():
-    assert jm.on_rung(TASK, 0) is TASK
-    first, second, third = (jm.on_rung(TASK, rung) for rung in (1, 2, 3))
+    assert jm.model.on_rung(TASK, 0) is TASK
+    first, second, third = (jm.model.on_rung(TASK, rung) for rung in (1, 2, 3))
     added = [
         set(b.parameter_names) - set(a.parameter_names)
         for a, b in ((TASK, first), (first, second), (second, third))
@@ -92,14 +92,14 @@ def test_every_rung_adds_its_part():
 @pytest.mark.parametrize("rung", [-1, len(RUNGS)])
 def test_other_rungs_are_refused(rung):
     with pytest.raises(ValueError, match="must be one of 0 to 3"):
-        jm.on_rung(TASK, rung)
+        jm.model.on_rung(TASK, rung)
 
 
 def test_a_task_that_stands_on_a_rung_is_not_lifted_again():
     with pytest.raises(ValueError, match="already"):
-        jm.on_rung(jm.on_rung(TASK, 1), 2)
+        jm.model.on_rung(jm.model.on_rung(TASK, 1), 2)
     with pytest.raises(ValueError, match="has no activation or resonance yet"):
-        jm.fit(jm.on_rung(TASK, 1), drawn(expected(TASK), 12, 1), rungs=2)
+        jm.fit(jm.model.on_rung(TASK, 1), drawn(expected(TASK), 12, 1), rungs=2)
     with pytest.raises(ValueError, match="the highest is 3"):
         jm.fit(TASK, drawn(expected(TASK), 12, 1), rungs=4)
     with pytest.raises(ValueError, match="states segments or sigma"):
@@ -107,7 +107,7 @@ def test_a_task_that_stands_on_a_rung_is_not_lifted_again():
 
 
 def test_frequency_and_width_of_what_has_no_amplitude_are_not_free(x64):
-    plan = planned(jm.on_rung(TASK, 2), drawn(expected(TASK), 12, 1), FitOptions())
+    plan = planned(jm.model.on_rung(TASK, 2), drawn(expected(TASK), 12, 1), FitOptions())
     assert not {"harmonic_amplitude", "harmonic_frequency"} & set(plan.problem.coordinates.names)
 
 
@@ -122,7 +122,7 @@ def damping_ratio(task: jm.Isometric) -> float:
 
 def test_the_row_of_the_damping_ratio_is_its_slope(x64):
     """At next to no force, where tangents are the values at rest, against the eigenvalues."""
-    task = jm.on_rung(TASK, 2).replace(P_w=1e-6)
+    task = jm.model.on_rung(TASK, 2).replace(P_w=1e-6)
     problem = planned(task, drawn(expected(TASK), 12, 1), FitOptions()).problem
     (row,), c = problem.damping, problem.coordinates
     for i, name in enumerate(c.names):
@@ -136,7 +136,7 @@ def test_the_row_of_the_damping_ratio_is_its_slope(x64):
 def test_a_muscle_without_activation_and_a_moved_one_have_no_such_prior(x64):
     target = drawn(expected(TASK), 12, 1)
     assert planned(TASK, target, FitOptions()).problem.damping == ()
-    task = jm.on_rung(TASK, 1)
+    task = jm.model.on_rung(TASK, 1)
     assert planned(task, target, FitOptions(), moved=True).problem.damping == ()
     plan = planned(task, target, FitOptions(priors={"damping_ratio": None}))
     assert plan.problem.damping == () and plan.settings["damping_ratio_sd"] is None
@@ -157,7 +157,7 @@ def test_the_prior_of_a_fit_is_that_of_all_that_follows(x64):
 def test_targets_that_share_a_muscle_have_one_prior_of_its_damping(x64):
     from jaxmuscle.fits._joint import planned_jointly
 
-    task, target = jm.on_rung(TASK, 2), drawn(expected(TASK), 12, 1)
+    task, target = jm.model.on_rung(TASK, 2), drawn(expected(TASK), 12, 1)
     tasks, targets = {"a": task, "b": task}, {"a": target, "b": target}
     shared = planned_jointly(tasks, targets, FitOptions()).problem
     apart = planned_jointly(tasks, targets, FitOptions(), separate=("c_w",)).problem
@@ -193,7 +193,7 @@ def test_a_resonance_is_stated_for_a_peak_alone(x64):
     unseen = drawn(plain, 60, 2)
 
     def left_out(target: jm.Target, **values: float) -> set[str]:
-        task = jm.on_rung(TASK, 3)
+        task = jm.model.on_rung(TASK, 3)
         problem = planned(task, target, FitOptions()).problem
         table = {"corner_frequency": 1.0, "resonance_width": 2.0, "resonance_2_width": 2.0}
         table |= {"resonance_frequency": 9.0, "resonance_2_frequency": 3.0, "K_w0": 1.0} | values
@@ -347,7 +347,7 @@ def test_no_remedy_names_what_the_fit_does_not_have():
 def test_a_slow_twitch_is_told_by_the_fit():
     """A twitch of 0.25 s and ten times as many segments as above, so that the interval excludes
     that of human muscle."""
-    task = jm.on_rung(TASK, 2).replace(activation_time=0.25, noise_K_z=5e-4, **TREMOR)
+    task = jm.model.on_rung(TASK, 2).replace(activation_time=0.25, noise_K_z=5e-4, **TREMOR)
     result = jm.fit(task, drawn(expected(task), 900, 1), **QUICK)
     low, _ = result.derived["contraction_time"].interval or (None, None)
     assert low is not None and low > 0.11
@@ -431,18 +431,18 @@ def test_all_that_follows_a_fit_takes_a_model_with_tremor(tmp_path):
     )
     profiled = jm.profile(result, "resonance_frequency")
     assert str(profiled)
-    assert jm.goodness(result, replicates=19).p_value > 0
+    assert jm.checks.goodness(result, replicates=19).p_value > 0
     # Those that need no program of another task: at other forces, and for longer.
     same = [
         design
-        for design in jm.standard_designs(result)
+        for design in jm.uncertainty.standard_designs(result)
         if design.task is None or type(design.task) is jm.Isometric
     ]
     assert len(same) >= 3
-    told = jm.identifiability(
+    names = jm.identifiability(
         result, designs=[design for design in same if design.lengthening is None]
-    ).told
-    assert "resonance_frequency" in told and "tremor_frequency" not in told
+    ).names
+    assert "resonance_frequency" in names and "tremor_frequency" not in names
     with without_intervals():
         cohort = jm.fit_cohort([result.target], starts=8, rung=2)
     (found,) = cohort.results.values()

@@ -12,7 +12,7 @@ from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._options import FitOptions
 
 TREMOR = {"resonance_amplitude": 0.05, "resonance_frequency": 8.0, "resonance_width": 1.0}
-TRUTH = jm.on_rung(jm.PrescribedForce(observe="acceleration"), 2).replace(**TREMOR)
+TRUTH = jm.model.on_rung(jm.PrescribedForce(observe="acceleration"), 2).replace(**TREMOR)
 
 
 @functools.cache
@@ -26,7 +26,7 @@ def target() -> jm.Target:
 
 @functools.cache
 def result() -> jm.fits.FitResult:
-    task = jm.on_rung(jm.task_for(target()), 2)
+    task = jm.model.on_rung(jm.task_for(target()), 2)
     return jm.fit(task, target(), starts=16, seeds=16, check_seeds=16)  # as many each: one program
 
 
@@ -71,7 +71,7 @@ def test_an_acceleration_and_a_displacement_that_look_alike_are_no_batch(x64):
 
 def test_the_likelihood_is_highest_near_the_tremor(x64):
     low, here, high = (
-        float(jm.log_likelihood(TRUTH.replace(resonance_frequency=f), target()))
+        float(jm.objective.log_likelihood(TRUTH.replace(resonance_frequency=f), target()))
         for f in (7.0, 8.0, 9.0)
     )
     assert here > max(low, high) + 3

@@ -28,7 +28,7 @@ class Tendon(jm.model.AbstractLaw):
         return self.stiff * jnp.exp(self.toe * q)
 
 
-class Own(jm.AbstractMuscle):
+class Own(jm.model.AbstractMuscle):
     """A linear muscle without the method that only `PrescribedMotion` needs."""
 
     m_w: Scalar = 0.5
@@ -218,7 +218,7 @@ def test_a_custom_law_may_reuse_a_table_name():
     np.testing.assert_allclose(task.muscle.base()[1], 400.0, rtol=1e-6)
 
 
-class Linear(jm.AbstractMuscle):
+class Linear(jm.model.AbstractMuscle):
     """A whole muscle; here, and not in the test, so that its programs are kept."""
 
     m_w: Scalar = 0.5
@@ -267,7 +267,7 @@ def sharp(q):
 def bent(curve, place):
     """A muscle of one curve, through 0 with the slope 3, in one of its arguments."""
 
-    class Bent(jm.AbstractMuscle):
+    class Bent(jm.model.AbstractMuscle):
         m_w: float = 0.5
         m_z: float = 0.4
 

@@ -15,7 +15,7 @@ from jaxmuscle.model import TASKS
 from jaxmuscle.objective._arguments import free_names
 from jaxmuscle.objective._options import FitOptions
 
-TREMOR = jm.on_rung(jm.Isometric(), 2)
+TREMOR = jm.model.on_rung(jm.Isometric(), 2)
 KINDS = list(TASKS.values())
 
 
@@ -165,7 +165,11 @@ def test_a_notebook_shows_a_table_and_escapes_what_files_said():
     assert html.count("<tr>") == 1 + len(jm.Isometric().parameter_names) and "<td" in html
     wild = "<script>alert(1)</script> & co"
     recording = jm.Recording(np.sin(np.arange(3000.0)) + 3, 100.0, name=wild)
-    for shown in (recording, jm.Trials([recording]), jm.Target(wild, np.ones(30), segments=12)):
+    for shown in (
+        recording,
+        jm.data.Trials([recording]),
+        jm.Target(wild, np.ones(30), segments=12),
+    ):
         html = shown._repr_html_()
         assert (
             "<script" not in html
@@ -198,12 +202,12 @@ def test_spectra_sweeps_and_sensitivities_say_what_they_are():
         np.random.default_rng(0).normal(size=(3, 1500)), jm.SpectrumSettings()
     )
     assert "spectra   3; below, their mean" in str(several) and "<table>" in several._repr_html_()
-    sweep = jm.Sweep.grid(jm.Isometric(), k_w=[4e5, 5e5], noise_K_w=[0.1, 0.2, 0.3])
+    sweep = jm.ensembles.Sweep.grid(jm.Isometric(), k_w=[4e5, 5e5], noise_K_w=[0.1, 0.2, 0.3])
     assert str(sweep).splitlines()[
         0
     ] == "sweep of Isometric: 6 points" and "0.1 to 0.3, 3 values" in str(sweep)
     assert "k_w        4e+05 to 5e+05 N/m^3, 2 values" in str(sweep)
-    table = jm.sensitivity(jm.Isometric(), ("c_w", "harmonic_phase", "harmonic_frequency"))
+    table = jm.response.sensitivity(jm.Isometric(), ("c_w", "harmonic_phase", "harmonic_frequency"))
     lines, slopes = str(table).splitlines(), np.abs(table.proportional)
     assert [line.split()[0] for line in lines[2:]] == [
         "harmonic_frequency",

@@ -73,7 +73,7 @@ def test_slopes_by_name_against_differences_and_against_replace(x64):
         np.testing.assert_allclose(slopes[name], (ahead - behind) / (2 * h), rtol=SLOPE)
 
 
-class Own(jm.AbstractMuscle):
+class Own(jm.model.AbstractMuscle):
     """A muscle as a user writes one: plain numbers, one in a part that is a plain module, and a
     network, which holds functions."""
 
@@ -105,7 +105,7 @@ class Own(jm.AbstractMuscle):
         jm.PrescribedForce(activation=jm.Activation(1), initial=(0, 0, 0, 0)),
         jm.PrescribedMotion(F_ext=np.array(7.0), harmonic=jm.Harmonic(frequency=np.float32(9.5))),
         jm.PrescribedLength(x_z=jm.model.RampHold(0), noise=jm.OrnsteinUhlenbeckNoise(1, 1)),
-        jm.on_rung(jm.Isometric(), 3).replace(P_w=6, resonance_2_width=2),
+        jm.model.on_rung(jm.Isometric(), 3).replace(P_w=6, resonance_2_width=2),
         jm.Isometric(muscle=Own()),
     ],
     ids=lambda t: f"{type(t).__name__} {type(t.muscle).__name__} {t.activation is None}",

@@ -395,7 +395,8 @@ def test_several_tasks_in_one_are_refused_by_name():
         jm.expected_spectrum,
     ):
         with pytest.raises(
-            ValueError, match=r"task: these are several tasks in one, .* jaxmuscle\.Sweep"
+            ValueError,
+            match=r"task: these are several tasks in one, .* jaxmuscle\.ensembles\.Sweep",
         ):
             call(several)
     assert jax.vmap(lambda t: t.replace(c_w=1.0)["k_w"])(several).tolist() == [4e5, 5e5]

@@ -245,7 +245,7 @@ def test_a_coefficient_of_variation_adds_its_gaussian_density():
         ) + 0.5 * np.log(2 * np.pi)
         assert logs == pytest.approx(np.log(measured))
         assert float(
-            jm.log_likelihood(task, data) - jm.log_likelihood(task, bare)
+            jm.objective.log_likelihood(task, data) - jm.objective.log_likelihood(task, bare)
         ) == pytest.approx(density, rel=1e-6)
 
 
@@ -255,10 +255,10 @@ def test_a_dynamic_stiffness_adds_the_gaussian_density_of_its_parts(x64):
     true = np.asarray(jm.response.dynamic_stiffness(task, f))
     sd = np.array([0.02, 0.05, 0.1, 0.03]) * np.abs(true)
     measured = true + sd * np.array([1.0 - 0.5j, -2.0 + 1.5j, 0.3j, 0.7])
-    figure = jm.FrequencyResponse(f, measured, sd)
+    figure = jm.data.FrequencyResponse(f, measured, sd)
     density = scipy.stats.norm.logpdf([(measured - true).real, (measured - true).imag], scale=sd)
     expected = density.sum() + f.size * np.log(2 * np.pi)
-    found = jm.log_likelihood(task, jm.Target("figure", None, stiffness=figure))
+    found = jm.objective.log_likelihood(task, jm.Target("figure", None, stiffness=figure))
     assert float(found) == pytest.approx(expected, rel=1e-9)
 
 
@@ -273,13 +273,13 @@ def test_whittle_is_the_law_of_a_periodogram():
     density = scipy.stats.ncx2.logpdf(
         2 * np.asarray(spectrum.power) / noise, 2, 2 * line / noise
     ) + np.log(2 / noise)
-    assert float(jm.log_likelihood(task, data)) == pytest.approx(density.sum(), rel=1e-9)
+    assert float(jm.objective.log_likelihood(task, data)) == pytest.approx(density.sum(), rel=1e-9)
     quiet = task.replace(harmonic_amplitude=0.0)
     expected = np.asarray(
         jm.expected_spectrum(jm.settled(quiet), spectrum.settings, (0.0, 60.0)).power
     )
     plain = -np.sum(np.log(expected) + np.asarray(spectrum.power) / expected)
-    assert float(jm.log_likelihood(quiet, data)) == pytest.approx(plain, rel=1e-9)
+    assert float(jm.objective.log_likelihood(quiet, data)) == pytest.approx(plain, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["vastus-lateralis-26mvc", "recording"])
@@ -287,7 +287,7 @@ def test_likelihoods_are_differentiable(name):
     data = recording() if name == "recording" else jm.load_target(name)
 
     def height(c_w):
-        return jm.log_likelihood(jm.Isometric().replace(c_w=c_w), data)
+        return jm.objective.log_likelihood(jm.Isometric().replace(c_w=c_w), data)
 
     step = 1e-3
     heights, slopes = at_once(
@@ -299,16 +299,17 @@ def test_likelihoods_are_differentiable(name):
 def test_a_recording_prefers_the_muscle_that_made_it():
     data = recording()
     heights = [
-        float(jm.log_likelihood(jm.Isometric().replace(c_w=c), data)) for c in (30.0, 60.0, 120.0)
+        float(jm.objective.log_likelihood(jm.Isometric().replace(c_w=c), data))
+        for c in (30.0, 60.0, 120.0)
     ]
     assert np.argmax(heights) == 1
 
 
 def test_what_has_no_likelihood():
     with pytest.raises(ValueError, match="does not state its segments"):
-        jm.log_likelihood(jm.Isometric(), jm.Target("bare", np.linspace(2, 1, 30)))
+        jm.objective.log_likelihood(jm.Isometric(), jm.Target("bare", np.linspace(2, 1, 30)))
     with pytest.raises(ValueError, match="below half the sampling rate"):
-        jm.log_likelihood(
+        jm.objective.log_likelihood(
             jm.Isometric().replace(harmonic_frequency=60.0),
             jm.load_target("vastus-lateralis-26mvc"),
         )

@@ -38,7 +38,7 @@ def stacked(trees):
 
 
 def loss(task, data):
-    return -jm.log_likelihood(task, data)
+    return -jm.objective.log_likelihood(task, data)
 
 
 @pytest.fixture(autouse=True)
@@ -87,9 +87,11 @@ def test_all_numbers_of_all_people_are_trained_by_one_program():
 
 def test_mapped_likelihoods_are_those_of_the_targets_one_by_one():
     tasks, _, seen, _ = trained()
-    alone = [-float(jm.log_likelihood(task, person(i))) for i, task in enumerate(tasks)]
+    alone = [-float(jm.objective.log_likelihood(task, person(i))) for i, task in enumerate(tasks)]
     np.testing.assert_allclose(seen[0][0], alone, rtol=1e-10)
-    bare = [-float(jm.log_likelihood(task, person(i).data())) for i, task in enumerate(tasks)]
+    bare = [
+        -float(jm.objective.log_likelihood(task, person(i).data())) for i, task in enumerate(tasks)
+    ]
     np.testing.assert_array_equal(bare, alone)
 
 
@@ -119,9 +121,9 @@ def test_data_are_arrays_and_settings():
 
 def test_data_that_cannot_be_used_are_refused():
     with pytest.raises(ValueError, match=r"JAX is tracing the target 'person 0'. Give its arrays"):
-        jax.jit(jm.log_likelihood)(TASK, person(0))
+        jax.jit(jm.objective.log_likelihood)(TASK, person(0))
     with pytest.raises(ValueError, match=r"these are of 3 targets in one. Map over them"):
-        jm.log_likelihood(TASK, stacked([person(i).data() for i in range(3)]))
+        jm.objective.log_likelihood(TASK, stacked([person(i).data() for i in range(3)]))
     with pytest.raises(ValueError, match="does not state its segments"):
         jm.Target("bare", np.ones(30)).data()
 
@@ -130,17 +132,20 @@ NAMES = ("k_w", "noise_K_w", "harmonic_frequency", "harmonic_phase", "P_w")
 
 
 def test_free_parameters_as_a_vector_and_back():
-    free = jm.free(TASK, NAMES)
-    assert free.names == NAMES and jm.free(TASK).names == jm.problem(TASK, BUNDLED).names
+    free = jm.objective.free(TASK, NAMES)
+    assert (
+        free.names == NAMES
+        and jm.objective.free(TASK).names == jm.fits.problem(TASK, BUNDLED).names
+    )
     assert free.task(free.start).parameters == pytest.approx(TASK.parameters, rel=1e-14)
     vector = free.start + np.linspace(-0.5, 0.5, len(NAMES))
     task = free.task(vector)
     np.testing.assert_allclose(free.vector(task), vector, rtol=1e-12)
     assert {name: task[name] for name in NAMES} == free.parameters(vector)
     assert task["c_w"] == TASK["c_w"]
-    row = jm.PARAMETERS["k_w"]
+    row = jm.model.PARAMETERS["k_w"]
     assert task["k_w"] == pytest.approx(5e5 * np.exp(-0.5 * row.prior_sd))
-    inside = jm.free(TASK, ["k_w"], bounds={"k_w": (1e5, 2e6)})
+    inside = jm.objective.free(TASK, ["k_w"], bounds={"k_w": (1e5, 2e6)})
     for step, limit in ((-50.0, 1e5), (50.0, 2e6)):
         assert inside.task(np.array([step]))["k_w"] == pytest.approx(limit)
     assert "free parameters of Isometric" in str(free) and "harmonic_phase" in str(free)
@@ -149,7 +154,7 @@ def test_free_parameters_as_a_vector_and_back():
 def test_a_problem_has_the_same_coordinates():
     """And the same prior, but for that of the damping ratio, which these two do not move."""
     names = ("noise_K_w", "harmonic_frequency")
-    free, problem = jm.free(TASK, names), jm.problem(TASK, BUNDLED, free=names)
+    free, problem = jm.objective.free(TASK, names), jm.fits.problem(TASK, BUNDLED, free=names)
     vector = np.array([0.3, -0.7])
     assert free.parameters(vector) == pytest.approx(
         {name: float(v) for name, v in problem.parameters(vector).items()}, rel=1e-12
@@ -161,7 +166,7 @@ def test_a_problem_has_the_same_coordinates():
 
 def test_free_is_a_pytree_of_many_people():
     """Its slope: `dv/dθ = sd v` of a positive parameter."""
-    people = [jm.free(TASK.replace(k_w=k), NAMES) for k in (3e5, 6e5)]
+    people = [jm.objective.free(TASK.replace(k_w=k), NAMES) for k in (3e5, 6e5)]
     vectors = jnp.stack([free.start + 0.1 for free in people])
 
     def level(vector, free):
@@ -172,7 +177,7 @@ def test_free_is_a_pytree_of_many_people():
 
     again, values, slopes = jax.jit(jax.vmap(both))(stacked(people), vectors)
     np.testing.assert_allclose(again, vectors, rtol=1e-9)
-    sd = jm.PARAMETERS["k_w"].prior_sd
+    sd = jm.model.PARAMETERS["k_w"].prior_sd
     np.testing.assert_allclose(values, [k * np.exp(0.1 * sd) for k in (3e5, 6e5)])
     np.testing.assert_allclose(slopes[:, 0], sd * values)
     assert np.all(slopes[:, 1:] == 0)
@@ -182,19 +187,19 @@ def test_free_is_a_pytree_of_many_people():
 
 def test_what_cannot_be_free_is_refused():
     with pytest.raises(ValueError, match="unknown or not free parameter 'k'"):
-        jm.free(TASK, ["k"])
+        jm.objective.free(TASK, ["k"])
     with pytest.raises(ValueError, match="give a list of names"):
-        jm.free(TASK, "k_w")
+        jm.objective.free(TASK, "k_w")
     with pytest.raises(ValueError, match="bounds: unknown or not free parameter 'c_w'"):
-        jm.free(TASK, ["k_w"], bounds={"c_w": (1.0, 2.0)})
+        jm.objective.free(TASK, ["k_w"], bounds={"c_w": (1.0, 2.0)})
     with pytest.raises(ValueError, match="must lie inside its bounds"):
-        jm.free(TASK, ["k_w"], bounds={"k_w": (1.0, 2.0)})
+        jm.objective.free(TASK, ["k_w"], bounds={"k_w": (1.0, 2.0)})
     with pytest.raises(ValueError, match=r"JAX is tracing it .* Call free outside"):
-        jax.jit(lambda k: jm.free(TASK.replace(k_w=k)).start)(4e5)
-    free = jm.free(TASK, ["k_w", "c_w"])
+        jax.jit(lambda k: jm.objective.free(TASK.replace(k_w=k)).start)(4e5)
+    free = jm.objective.free(TASK, ["k_w", "c_w"])
     with pytest.raises(
         ValueError, match=r"shape \(3,\), this takes \(2,\), a number for each of k_w"
     ):
         free.task(np.zeros(3))
     with pytest.raises(ValueError, match=r"k_w = 0.0 lies outside"):
-        jm.free(TASK, ["k_w"], bounds={"k_w": (1e3, 1e9)}).vector(TASK.replace(k_w=0.0))
+        jm.objective.free(TASK, ["k_w"], bounds={"k_w": (1e3, 1e9)}).vector(TASK.replace(k_w=0.0))

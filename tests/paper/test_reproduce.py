@@ -266,7 +266,7 @@ def test_the_preset_of_figures_2_to_5_is_the_expected_fit_to_four_digits():
     values = {
         name: row["value"]
         for name, row in json.loads(written)["values"].items()
-        if name in jm.PARAMETERS
+        if name in jm.model.PARAMETERS
     }
     preset = jm.load_preset("zagrodny-slifkin")
     assert {name: preset[name] for name in values} == {

@@ -254,7 +254,7 @@ MEASURED = (
 def recorded():
     """One recording, its target, and what is measured of it."""
     (held,) = trials(1)
-    return held.target(), jm.steadiness(held)
+    return held.target(), jm.data.steadiness(held)
 
 
 def of_recordings(**changes):

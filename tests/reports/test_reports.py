@@ -129,14 +129,10 @@ def posterior(success):
         "ess_bulk": 900.0,
         "ess_tail": 800.0,
     }
-    summary = SimpleNamespace(
-        rows={"k_w": (), "corner_frequency": ()}, units={"k_w": "N/m^3", "corner_frequency": "Hz"}
-    )
-
-    class Table(SimpleNamespace):
-        def __getitem__(self, name):
-            return row
-
+    rows = {
+        "k_w": row | {"unit": "N/m^3", "determined": False},
+        "corner_frequency": row | {"unit": "Hz", "determined": True},
+    }
     target = jm.Target(HOSTILE, POWER, segments=[6])
     return SimpleNamespace(
         success=success,
@@ -145,9 +141,8 @@ def posterior(success):
         settings={"chains": 4},
         seed=1,
         versions={"jaxmuscle": "0.1"},
-        determined=("corner_frequency",),
         parts={"a": SimpleNamespace(target=target)},
-        summary=lambda: Table(**vars(summary)),
+        summary=lambda: SimpleNamespace(rows=rows),
     )
 
 

@@ -184,7 +184,7 @@ def test_any_linear_system(x64, name):
 # --- a drive that multiplies
 
 
-class Multiplied(jm.AbstractMuscle):
+class Multiplied(jm.model.AbstractMuscle):
     """Its pull loses with the square of the shortening; a noisy drive multiplies what is left, not
     P_w."""
 

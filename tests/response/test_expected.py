@@ -448,8 +448,8 @@ PUBLIC = {
     "expected_spectrum": lambda task, target: jm.expected_spectrum(task).power,
     "expected_variation": lambda task, target: jm.response.expected_variation(task),
     "its derivative": derivative,
-    "log_likelihood": jm.log_likelihood,
-    "sensitivity": lambda task, target: jm.sensitivity(task, ["k_w"]).power,
+    "log_likelihood": jm.objective.log_likelihood,
+    "sensitivity": lambda task, target: jm.response.sensitivity(task, ["k_w"]).power,
     "simulate": lambda task, target: jm.simulate(task, KEY, duration=1.0).output,
     "fit": lambda task, target: jm.fit(task, target, rungs=0, starts=4, max_steps=3).task["k_w"],
 }
@@ -489,8 +489,8 @@ def test_fits_and_likelihoods_expect_the_aliases_of_the_recording(x64):
         own, other = (
             jm.Target.from_table(exact | {"recorded_at": r}) for r in (rate, 500e6 / rate)
         )
-        assert jm.log_likelihood(task, own) > jm.log_likelihood(task, other)
-        model = Part("", task, own, at, (0,), None, None).linear("log").model
+        assert jm.objective.log_likelihood(task, own) > jm.objective.log_likelihood(task, other)
+        model = Part("", task, own, at, (0,), None, None).linear().model
         found = model.moments(as_arrays(task.with_parts(settings=settings)))
         np.testing.assert_allclose(found.proportional, shape, rtol=1e-10)
 
@@ -881,7 +881,7 @@ def test_a_task_from_outside_a_compiled_function():
     np.testing.assert_allclose(scaled, 2 * np.asarray(jm.expected_spectrum(task).power), rtol=1e-5)
 
 
-class Crossbridge(jm.AbstractMuscle):
+class Crossbridge(jm.model.AbstractMuscle):
     """A user's own muscle: a cubic active and a linear passive tissue. Counts how often it is
     traced."""
 

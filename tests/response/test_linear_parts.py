@@ -86,7 +86,7 @@ LAGS = np.array([0.0, 0.004, 0.05, 0.3, -0.3])
 
 @pytest.mark.parametrize(
     "task",
-    [jm.on_rung(jm.Isometric(), 2), jm.Isometric(noise=jm.PinkNoise(shared=True))],
+    [jm.model.on_rung(jm.Isometric(), 2), jm.Isometric(noise=jm.PinkNoise(shared=True))],
     ids=["activation and resonance", "pink, shared"],
 )
 def test_autocovariance_is_the_transform_of_the_density(task):
@@ -100,7 +100,7 @@ def test_autocovariance_is_the_transform_of_the_density(task):
 
 
 def test_autocovariance_of_any_shape_and_at_any_lag():
-    task = jm.on_rung(jm.Isometric(), 2)
+    task = jm.model.on_rung(jm.Isometric(), 2)
     grid = np.asarray(jm.response.autocovariance(task, LAGS[:4].reshape(2, 2)))
     assert grid.shape == (2, 2) and jm.response.autocovariance(task, 0.05).shape == ()
     np.testing.assert_allclose(grid[1, 0], jm.response.autocovariance(task, 0.05), rtol=1e-12)
@@ -109,7 +109,7 @@ def test_autocovariance_of_any_shape_and_at_any_lag():
 
 def test_slopes_of_the_autocovariance_are_those_of_differences():
     """With the task and with the lag: one that is not 0 everywhere, in reverse mode."""
-    task, lag = jm.on_rung(jm.Isometric(), 2), 0.05
+    task, lag = jm.model.on_rung(jm.Isometric(), 2), 0.05
 
     def at(k_w, lag):
         return jm.response.autocovariance(task.replace(k_w=k_w), lag)

@@ -90,7 +90,11 @@ def test_the_mean_of_a_squared_gaussian(x64):
 
 def test_linear_numbers_come_with_a_warning_where_first_order_ends():
     loud = jm.Isometric().replace(harmonic_amplitude=0.3)
-    for number in (jm.expected_spectrum, jm.sensitivity, lambda task: jm.at_level(task, 0.5)):
+    for number in (
+        jm.expected_spectrum,
+        jm.response.sensitivity,
+        lambda task: jm.response.at_level(task, 0.5),
+    ):
         with pytest.warns(
             FirstOrderWarning,
             match=r"is not exact here: what it leaves out adds about .* to the power",
@@ -98,7 +102,7 @@ def test_linear_numbers_come_with_a_warning_where_first_order_ends():
             number(loud)
     target = jm.Target("x", np.ones(30), segments=[12])
     with pytest.warns(FirstOrderWarning):
-        jm.log_likelihood(loud, target)
+        jm.objective.log_likelihood(loud, target)
     with jax.enable_x64(True), warnings.catch_warnings():
         warnings.simplefilter("error")
         jax.jit(lambda a: jm.expected_spectrum(jm.Isometric().replace(harmonic_amplitude=a)).power)(
@@ -140,9 +144,9 @@ def test_an_input_that_moves_in_the_window_is_refused(name):
     target = jm.Target("x", np.ones(30), segments=[12])
     for number in (
         lambda: jm.fit(task, target),
-        lambda: jm.log_likelihood(task, target),
-        lambda: jm.sensitivity(task),
-        lambda: jm.at_level(task, 0.5),
+        lambda: jm.objective.log_likelihood(task, target),
+        lambda: jm.response.sensitivity(task),
+        lambda: jm.response.at_level(task, 0.5),
     ):
         with pytest.raises(OperatingPointError, match="P_w of this Isometric moves"):
             number()

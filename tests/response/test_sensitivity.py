@@ -13,12 +13,12 @@ TASK = jm.Isometric()
 @functools.cache
 def whole():
     """That of all parameters: half a minute of compiling."""
-    return jm.sensitivity(TASK)
+    return jm.response.sensitivity(TASK)
 
 
 def test_every_entry_is_a_difference_quotient(x64):
     names = ("k_w", "c_z", "noise_K_w", "harmonic_frequency", "x_z")
-    found = jm.sensitivity(TASK, names)
+    found = jm.response.sensitivity(TASK, names)
     for row, name in enumerate(names):
         value = float(TASK[name])
         h = 1e-5 * (value or 1e-2)
@@ -70,4 +70,4 @@ def test_the_heat_map_names_what_matters():
 
 def test_an_unknown_parameter_is_named():
     with pytest.raises(ValueError, match=r"unknown parameter 'k_x': did you mean 'k_"):
-        jm.sensitivity(TASK, ("k_x",))
+        jm.response.sensitivity(TASK, ("k_x",))

@@ -13,7 +13,7 @@ from jaxmuscle.response._characteristics import StaticCharacteristics, static_ch
 EXACT = {"rtol": 1e-12, "atol": 1e-12}
 
 
-class Tendon(jm.AbstractMuscle):
+class Tendon(jm.model.AbstractMuscle):
     """A user's muscle: linear active spring with an offset, exponential passive one, linear
     dampers."""
 

@@ -40,7 +40,7 @@ def test_plain_monte_carlo_has_the_expected_spectrum(x64):
     by 1 s to e^-7."""
     window = (1.0, 6.12)
     base = jm.PrescribedForce(5.0, 1.0, observe="acceleration")
-    task = jm.on_rung(base, 2).replace(
+    task = jm.model.on_rung(base, 2).replace(
         resonance_amplitude=0.05, harmonic_amplitude=base["harmonic_amplitude"]
     )
     task = jm.settled(task)

@@ -10,6 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import matplotlib.pyplot as plt
+import msgspec
 import numpy as np
 import pytest
 import scipy.linalg
@@ -271,7 +272,9 @@ def test_determined_quantities_scatter_as_the_report_says(x64):
 
 
 def test_a_longer_recording_multiplies_the_information():
-    report = jm.identifiability(fitted(), designs=[jm.Design("more", segments=9 * SEGMENTS)])
+    report = jm.identifiability(
+        fitted(), designs=[jm.uncertainty.Design("more", segments=9 * SEGMENTS)]
+    )
     degrees = [jm.SpectrumSettings().degrees_of_freedom(k) for k in (SEGMENTS, 9 * SEGMENTS)]
     shown = report.present.singular_values > 1e-2  # below, rounding
     ratio = report.designs[0].singular_values[shown] / report.present.singular_values[shown]
@@ -284,7 +287,9 @@ def test_a_longer_recording_multiplies_the_information():
 def test_a_single_number_adds_one_row(x64, what):
     problem, theta = setup_at(fitted())
     given = {"coefficient_of_variation": True} if what == "variation" else {"mean": 0.03}
-    found = design_information(problem, theta, jm.Design("one number", segments=0, **given))
+    found = design_information(
+        problem, theta, jm.uncertainty.Design("one number", segments=0, **given)
+    )
     if what == "variation":
         # The variance in the window ripples with the frequency.
         row = slopes(TRUTH, lambda m: 0.5 * np.log(m.variance) - np.log(m.mean), step=0.2 * STEP)
@@ -298,7 +303,9 @@ def test_a_single_number_adds_one_row(x64, what):
 
 
 def test_a_known_mean_is_known_as_well_as_it_was_measured():
-    report = jm.identifiability(fitted(), designs=[jm.Design("the mean", segments=0, mean=0.02)])
+    report = jm.identifiability(
+        fitted(), designs=[jm.uncertainty.Design("the mean", segments=0, mean=0.02)]
+    )
     mean = report.designs[0].quantities["model_mean"]
     # The prior adds next to nothing: its own error is 79 %.
     assert (
@@ -309,12 +316,14 @@ def test_a_known_mean_is_known_as_well_as_it_was_measured():
 
 def test_a_design_at_other_values_knows_the_factors(x64):
     """Information about θ at the design's own values, as if its task had been fitted."""
-    stronger = jm.at_level(TRUTH, 0.5)
+    stronger = jm.response.at_level(TRUTH, 0.5)
     assert float(stronger["k_w"]) > 1.5 * float(TRUTH["k_w"])
     elsewhere = {n: 0.7 * float(TRUTH[n]) for n in DEFAULT_FREE}
     problem, theta = setup_at(fitted(settings={"prior_centre": elsewhere}))
     np.testing.assert_allclose(theta, -np.log(0.7))
-    found = design_information(problem, theta, jm.Design("half of the maximum", stronger, 12))
+    found = design_information(
+        problem, theta, jm.uncertainty.Design("half of the maximum", stronger, 12)
+    )
     same_information(found, proportional_information(stronger, (12,)))
 
 
@@ -322,8 +331,10 @@ def test_separate_parameters_are_eliminated(x64):
     problem, theta = setup_at(fitted())
     task = TRUTH.replace(P_w=10.0)
     present = information_of(problem, expansion_at(problem, theta))
-    tied = design_information(problem, theta, jm.Design("tied", task))
-    loose = design_information(problem, theta, jm.Design("loose", task, separate=AMPLITUDES))
+    tied = design_information(problem, theta, jm.uncertainty.Design("tied", task))
+    loose = design_information(
+        problem, theta, jm.uncertainty.Design("loose", task, separate=AMPLITUDES)
+    )
     own = [DEFAULT_FREE.index(n) for n in AMPLITUDES]
     where = np.arange(8)
     where[own] = 8 + np.arange(3)
@@ -341,7 +352,7 @@ def test_separate_parameters_are_eliminated(x64):
 
 def test_the_load_keeps_the_operating_point(x64):
     result = fitted()
-    design = next(d for d in jm.standard_designs(result) if "displacement" in d.name)
+    design = next(d for d in jm.uncertainty.standard_designs(result) if "displacement" in d.name)
     assert isinstance(design.task, jm.PrescribedForce)
     held, moving = np.asarray(equilibrium(TRUTH)), np.asarray(equilibrium(design.task))
     np.testing.assert_allclose(moving, [held[0], 0, 0, 0], atol=1e-9)
@@ -373,7 +384,7 @@ VARIATION = "the coefficient of variation"
     ids=["isometric", "all numbers known", "force"],
 )
 def test_the_usual_designs(given, names):
-    designs = jm.standard_designs(fitted(**given))
+    designs = jm.uncertainty.standard_designs(fitted(**given))
     assert [design.name for design in designs] == names
     for design in designs:
         assert (design.separate == AMPLITUDES) is design.name.startswith("a second force level")
@@ -386,13 +397,17 @@ def test_the_usual_designs_of_a_motion(monkeypatch):
         "expansion_at",
         lambda problem, theta: Expansion(theta, (moments_of(problem.parts[0].task),), None),
     )
-    names = [design.name for design in jm.standard_designs(fitted(jm.PrescribedMotion(F_ext=8.0)))]
+    names = [
+        design.name
+        for design in jm.uncertainty.standard_designs(fitted(jm.PrescribedMotion(F_ext=8.0)))
+    ]
     assert names == [VARIATION, "the mean force, known to 2 %", *LEVELS, LONGER]
 
 
 def test_no_design_is_above_the_maximal_force():
     names = [
-        [d.name for d in jm.standard_designs(fitted(mvc_fraction=level))] for level in (0.5, 0.6)
+        [d.name for d in jm.uncertainty.standard_designs(fitted(mvc_fraction=level))]
+        for level in (0.5, 0.6)
     ]
     assert set(names[0]) - set(names[1]) == {LEVELS[0]} and LEVELS[1] in names[1]
 
@@ -513,7 +528,7 @@ def test_a_report_about_a_fit_that_misses_its_data_says_so_first():
     missing = eqx.tree_at(
         lambda r: r.adequacy,
         fitted(),
-        kept._replace(chi2=4 * kept.expected, p=1e-4),
+        msgspec.structs.replace(kept, chi2=4 * kept.expected, p=1e-4),
         is_leaf=lambda x: isinstance(x, type(kept)),
     )
     found = jm.identifiability(missing, designs=())
@@ -529,7 +544,7 @@ def test_a_report_about_a_fit_that_misses_its_data_says_so_first():
         jm.identifiability(missing, missing.target, designs=()),
     ):
         assert "does not describe" not in str(about)
-    motion = jm.design_input(missing, seconds=10.0, band=(0.5, 5.0), rate=50.0)
+    motion = jm.uncertainty.design_input(missing, seconds=10.0, band=(0.5, 5.0), rate=50.0)
     assert motion.notices == found.notices[:1] == tuple(motion.to_dict()["notices"])
     assert "note: the fit does not describe its data" in in_a_line(motion)
 
@@ -562,7 +577,9 @@ def test_of_designs_that_determine_as_much_the_one_with_smaller_errors_is_named(
     lengthenings = [
         jm.uncertainty.Lengthening.flat(1e-3, (0.5, 5.0), seconds) for seconds in (30.0, 240.0)
     ]
-    moved = [jm.Design(f"{x.seconds:g} s", segments=0, lengthening=x) for x in lengthenings]
+    moved = [
+        jm.uncertainty.Design(f"{x.seconds:g} s", segments=0, lengthening=x) for x in lengthenings
+    ]
     found = jm.identifiability(fitted(), designs=moved[::order])
     short, long = found.designs[::order]
     assert (short.determined, len(short.gained)) == (long.determined, len(long.gained))
@@ -606,7 +623,10 @@ def test_a_design_without_equilibrium_is_impossible_and_the_rest_goes_on():
     undamped = TRUTH.replace(c_w=0.0, c_z=0.0)
     found = jm.identifiability(
         fitted(),
-        designs=[jm.Design("undamped", undamped), jm.Design("the mean", segments=0, mean=0.02)],
+        designs=[
+            jm.uncertainty.Design("undamped", undamped),
+            jm.uncertainty.Design("the mean", segments=0, mean=0.02),
+        ],
     )
     assert found.designs[0].failed is not None and "undamped" in found.designs[0].failed
     assert found.designs[0].quantities["k_w"].stderr == found.present.quantities["k_w"].stderr
@@ -639,22 +659,34 @@ def test_another_target_can_be_given():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: jm.Design("nothing", segments=0), "nothing: measures nothing: give segments"),
-        (lambda: jm.Design("few", segments=-1), "few: segments = -1 must not be negative"),
         (
-            lambda: jm.Design("exact", mean=0.0),
+            lambda: jm.uncertainty.Design("nothing", segments=0),
+            "nothing: measures nothing: give segments",
+        ),
+        (
+            lambda: jm.uncertainty.Design("few", segments=-1),
+            "few: segments = -1 must not be negative",
+        ),
+        (
+            lambda: jm.uncertainty.Design("exact", mean=0.0),
             "exact: mean = 0.0 must be a positive relative standard error",
         ),
         (
-            lambda: jm.identifiability(fitted(), designs=[jm.Design("a"), jm.Design("a")]),
+            lambda: jm.identifiability(
+                fitted(), designs=[jm.uncertainty.Design("a"), jm.uncertainty.Design("a")]
+            ),
             "two are called 'a'",
         ),
         (
-            lambda: jm.identifiability(fitted(), designs=[jm.Design("a", separate=("m_w",))]),
+            lambda: jm.identifiability(
+                fitted(), designs=[jm.uncertainty.Design("a", separate=("m_w",))]
+            ),
             "a: separate: 'm_w' is not free in the fit; free are k_w, ",
         ),
         (
-            lambda: jm.identifiability(fitted(), designs=[jm.Design("x", LOADED, mean=0.1)]),
+            lambda: jm.identifiability(
+                fitted(), designs=[jm.uncertainty.Design("x", LOADED, mean=0.1)]
+            ),
             "x: the mean of its output is",
         ),
         (lambda: jm.identifiability(fitted(segments=None)), "states neither segments nor sigma"),
@@ -676,7 +708,9 @@ def test_bad_arguments(make, message):
 def displaced():
     """The design of a displacement: its task, and what it promises."""
     promised = next(d for d in jm.identifiability(fitted()).designs if "displacement" in d.name)
-    return next(d.task for d in jm.standard_designs(fitted()) if d.name == promised.name), promised
+    return next(
+        d.task for d in jm.uncertainty.standard_designs(fitted()) if d.name == promised.name
+    ), promised
 
 
 def test_a_design_keeps_its_promise(x64):
@@ -738,7 +772,10 @@ def test_a_joint_fit_reports_the_promised_errors():
 def test_pairs_add_up(x64):
     """A pair's information is the sum of its parts'."""
     problem, theta = setup_at(fitted())
-    designs = [jm.Design("the mean", segments=0, mean=0.02), jm.Design("longer", segments=100)]
+    designs = [
+        jm.uncertainty.Design("the mean", segments=0, mean=0.02),
+        jm.uncertainty.Design("longer", segments=100),
+    ]
     found = jm.identifiability(fitted(), designs=designs).pairs
     present = information_of(problem, expansion_at(problem, theta))
     both = present + sum(design_information(problem, theta, d) for d in designs)

@@ -119,7 +119,7 @@ def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
     problem, theta = fitted_problem(hold(), None)
     told, problem, theta = problem, with_open_masses(problem), np.append(theta, [0.0, 0.0])
     lengthening = FLAT
-    design = jm.Design("moved", PULLED, segments=0, lengthening=FLAT)
+    design = jm.uncertainty.Design("moved", PULLED, segments=0, lengthening=FLAT)
     found = design_information(problem, theta, design)
     f = lengthening.frequency
     up, down = (
@@ -154,7 +154,7 @@ def test_two_moved_records_know_of_the_masses_once():
     once = FLAT
     twice = Lengthening(once.frequency, 2 * once.power, SECONDS)
     moved = {
-        name: jm.Design(name, TRUTH, segments=0, lengthening=given)
+        name: jm.uncertainty.Design(name, TRUTH, segments=0, lengthening=given)
         for name, given in (("a", once), ("b", once), ("both", twice))
     }
     report = jm.identifiability(hold(), designs=moved.values())
@@ -229,7 +229,7 @@ def test_a_mass_that_a_moved_record_was_fitted_with_is_known(x64):
         and with_open_masses(other) is other
     )
     assert with_open_masses(problem).coordinates.names == (*problem.coordinates.names, "m_w", "m_z")
-    design = jm.Design("pulled", TRUTH, segments=0, lengthening=moved, target="hold")
+    design = jm.uncertainty.Design("pulled", TRUTH, segments=0, lengthening=moved, target="hold")
     assert "(m_z fitted in this measurement)" in design.describe(both)[1]
 
 
@@ -238,7 +238,7 @@ def test_what_a_record_tells_if_the_muscle_is_another_one():
     its prior's, no more."""
     task = PULLED
     given = {"seconds": SECONDS, "band": BAND, "rate": 50.0}
-    made = jm.design_input(task, "K_w0", **given)
+    made = jm.uncertainty.design_input(task, "K_w0", **given)
     factor = np.exp(made.now["K_w0"] / made.values["K_w0"])
     (low, below), (high, above) = made.elsewhere["K_w0"]
     assert high / made.values["K_w0"] == pytest.approx(factor, rel=1e-6)
@@ -283,7 +283,9 @@ def designed(**given):
     its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_input_design, "_elsewhere", lambda *_: (np.nan, np.nan))
-        return jm.design_input(hold(), **({"seconds": SECONDS, "band": BAND, "rate": 50.0} | given))
+        return jm.uncertainty.design_input(
+            hold(), **({"seconds": SECONDS, "band": BAND, "rate": 50.0} | given)
+        )
 
 
 def test_repeats_scatter_as_said_and_the_designed_motion_beats_the_flat_one():
@@ -494,7 +496,9 @@ def test_a_quantity_of_several_targets_has_its_plain_name():
 
 
 def test_the_same_key_the_same_motion():
-    again = jm.design_input(hold(), seconds=SECONDS, band=BAND, rate=50.0, key=jax.random.key(0))
+    again = jm.uncertainty.design_input(
+        hold(), seconds=SECONDS, band=BAND, rate=50.0, key=jax.random.key(0)
+    )
     np.testing.assert_array_equal(again.displacement, designed().displacement)
     assert not np.allclose(designed(key=1).displacement, designed().displacement)
     assert designed(key=1).stderr == pytest.approx(designed().stderr)
@@ -502,10 +506,12 @@ def test_the_same_key_the_same_motion():
 
 def test_a_task_instead_of_a_fit():
     """Its usual parameters are free, and there are no data: the start is the prior."""
-    made = jm.design_input(TRUTH, band=BAND, rate=50.0)
+    made = jm.uncertainty.design_input(TRUTH, band=BAND, rate=50.0)
     assert made.now["K_w0"] == pytest.approx(made.values["K_w0"])
     assert made.stderr["K_w0"] >= designed().stderr["K_w0"] * (1 - 1e-6)
-    loose = jm.design_input(TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w), band=BAND, rate=50.0)
+    loose = jm.uncertainty.design_input(
+        TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w), band=BAND, rate=50.0
+    )
     assert loose.stderr == pytest.approx(made.stderr)
 
 
@@ -513,10 +519,10 @@ def test_a_task_instead_of_a_fit():
 
 
 def test_the_standard_designs_know_what_a_flat_motion_tells():
-    designs = [d for d in jm.standard_designs(hold()) if d.lengthening is not None]
+    designs = [d for d in jm.uncertainty.standard_designs(hold()) if d.lengthening is not None]
     report = jm.identifiability(hold(), designs=designs)
     assert [d.name for d in report.designs] == MOVED
-    usual = inspect.signature(jm.design_input).parameters["band"].default
+    usual = inspect.signature(jm.uncertainty.design_input).parameters["band"].default
     bands = [(d.lengthening.frequency[0], d.lengthening.frequency[-1]) for d in designs]
     assert bands == [(0.5, 10.0), pytest.approx(usual)] and usual[0] == 0.5
     (small, large), made = report.designs, designed(band=usual)
@@ -581,7 +587,8 @@ def test_the_default_band_begins_where_the_page_advises():
         r"^\| band \| ([\d.]+) to", (pages.ROOT / "docs" / "perturbed.md").read_text(), re.MULTILINE
     )
     here, shell = (
-        inspect.signature(made).parameters["band"].default for made in (jm.design_input, design)
+        inspect.signature(made).parameters["band"].default
+        for made in (jm.uncertainty.design_input, design)
     )
     assert advised is not None and float(advised[1]) == here[0]
     assert shell == f"{here[0]:g}:{here[1]:g}"
@@ -656,7 +663,7 @@ def test_mistakes(given, message):
 
 def test_a_motor_needs_an_insertion_to_move():
     loose = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)
-    design = jm.Design("moved", loose, lengthening=Lengthening.flat(1e-3, BAND))
+    design = jm.uncertainty.Design("moved", loose, lengthening=Lengthening.flat(1e-3, BAND))
     with pytest.raises(
         ValueError, match="moved: lengthening: in PrescribedForce no motor moves the insertion"
     ):

@@ -98,7 +98,7 @@ def test_proportional_parameters_are_taken_up_with_their_ratio(x64):
         "noise_C_z",
         "harmonic_amplitude",
     )
-    tasks = {"low": jm.at_level(TRUTH, 0.15), "high": jm.at_level(TRUTH, 0.6)}
+    tasks = {"low": jm.response.at_level(TRUTH, 0.15), "high": jm.response.at_level(TRUTH, 0.6)}
     with without_intervals():
         joint = jm.fit_joint(
             targets(), tasks=tasks, free=("k_w", "c_w"), proportional=names, **QUICK
@@ -117,7 +117,7 @@ def test_the_likelihoods_of_the_targets_add_up(x64):
     moments = (
         expand(problem.linear(), problem.theta_of(tuple(joint.tasks.values()))[None]).row(0).moments
     )
-    each = [jm.log_likelihood(part.task, part.target) for part in joint.parts.values()]
+    each = [jm.objective.log_likelihood(part.task, part.target) for part in joint.parts.values()]
     # `log_likelihood` also has the normalisation of the coefficient of variation's law.
     each = [
         float(x) + np.log(part.variation[1]) for x, part in zip(each, problem.parts, strict=True)
@@ -156,7 +156,7 @@ def test_information_adds_up(x64):
 
 
 def test_a_design_names_the_target_that_it_is_like():
-    design = jm.Design("longer", segments=100, target="high")
+    design = jm.uncertainty.Design("longer", segments=100, target="high")
     assert "P_w = 8 N" in jm.identifiability(both(), designs=[design]).designs[0].task
     with pytest.raises(ValueError, match=r"longer: target: the fit has none called 'middle'"):
         jm.identifiability(both(), designs=[dataclasses.replace(design, target="middle")])
@@ -267,7 +267,7 @@ def test_goodness_of_two_targets():
     }
     with without_intervals():
         result = jm.fit_joint(pair, tasks=TASKS, free=FREE, **QUICK)
-    found = jm.goodness(result, replicates=99)
+    found = jm.checks.goodness(result, replicates=99)
     assert found.parts["high"].p_values["largest"] <= 0.02 < found.parts["low"].p_values["largest"]
     assert found.p_value <= 0.05
     assert "high: compared with 99 spectra" in str(found) and "all targets together: p = " in str(
@@ -281,7 +281,7 @@ def test_goodness_of_two_targets():
 def test_bootstrap_of_two_targets(monkeypatch):
     monkeypatch.setattr(_bootstrap, "STARTS", 8)
     with without_intervals():
-        found = jm.bootstrap(both(), replicates=12, key=2)
+        found = jm.checks.bootstrap(both(), replicates=12, key=2)
     assert {"c_w", "noise_K_w", "corner_frequency@low", "corner_frequency@high"} <= set(
         found.quantities
     )

@@ -430,7 +430,9 @@ def test_prescribed_motion_is_the_inverse_problem(x64):
 @pytest.mark.slow
 def test_own_muscles_run_at_scale(tmp_path):
     """A reduced, stored sweep over a parameter that only this muscle has."""
-    sweep = jm.Sweep.grid(TASKS["isometric"](muscle=HillMuscle()), velocity_max=[3.6, 4.2])
+    sweep = jm.ensembles.Sweep.grid(
+        TASKS["isometric"](muscle=HillMuscle()), velocity_max=[3.6, 4.2]
+    )
     options = SHORT | {"seeds": 12}
     found = jm.ensemble(sweep, KEY, reduce=True, store=tmp_path / "hill.zarr", **options)
     for point, task in enumerate(sweep):

@@ -28,7 +28,7 @@ def fitted(name):
         (pages.ROOT / "fitting" / "expected" / f"{name}.json").read_text(encoding="utf-8")
     )["values"]
     return jm.Isometric().replace(
-        **{key: row["value"] for key, row in values.items() if key in jm.PARAMETERS}
+        **{key: row["value"] for key, row in values.items() if key in jm.model.PARAMETERS}
     )
 
 
@@ -51,7 +51,8 @@ def test_the_force_read_is_less_than_the_force_of_the_muscle(x64):
     mean = kept_jit(jax.vmap(lambda v: linearise(jm.Isometric().replace(**v)).rest))
     rng, n = np.random.default_rng(0), 2000
     drawn = {
-        name: jm.PARAMETERS[name].default * np.exp(rng.normal(size=n)) for name in ("k_w", "k_z")
+        name: jm.model.PARAMETERS[name].default * np.exp(rng.normal(size=n))
+        for name in ("k_w", "k_z")
     }
     share = np.asarray(mean(drawn | {"x_z": np.zeros(n), "P_w": np.full(n, 5.0)})) / 5.0
     assert share.max() < 1 and (share.min(), share.max()) == pytest.approx(

@@ -74,7 +74,7 @@ IN_PYTHON = {
     # as docs/ensembles.md has it
     "summary = jm.ensemble(\n    result.task": "summary = jm.ensemble(\n    jm.Isometric()",
     "jm.identifiability(result)": f"jm.identifiability({PLAIN_FIT})",
-    "jm.design_input(result,": f"jm.design_input({PLAIN_FIT},",
+    "jm.uncertainty.design_input(result,": f"jm.uncertainty.design_input({PLAIN_FIT},",
 } | jitted(
     "jax.grad(variation)", "jax.grad(lambda v: jm.expected_spectrum(rebuild(v)).proportional[10])"
 )
@@ -343,9 +343,9 @@ def test_identifiability():
         "jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})",
         "(2.93, 0.06)},": "(2.93, 0.06)}, starts=16, seeds=16, check_seeds=16,",
         'jm.profile(joint, "K_w0")': 'joint["K_w0"]',
-        "jm.bootstrap(joint)": "",
+        "jm.checks.bootstrap(joint)": "",
         "jm.posterior(joint, key=0)": "",
-        "jm.goodness(joint)": "jm.goodness(joint, replicates=19)",
+        "jm.checks.goodness(joint)": "jm.checks.goodness(joint, replicates=19)",
     }
     names = pages.run("docs/identifiability.md", {}, fewer)
     assert len(names["report"].designs) == 4 and jm.load_result("joint.json").success
@@ -361,7 +361,7 @@ def test_own_data():
     # With a tremor at once: the program of the fit that fits/test_tremor.py makes.
     few = "rungs=0, starts=8, seeds=0, check_seeds=0"
     quick = {
-        "jm.task_for(tremor), tremor": f"jm.on_rung(jm.task_for(tremor), 2), tremor, {few}",
+        "jm.task_for(tremor), tremor": f"jm.model.on_rung(jm.task_for(tremor), 2), tremor, {few}",
         "held.target())\n": f"held.target(), {FEW})\n",
         "fit(jm.Isometric(), target)": f"fit(jm.Isometric(), target, {FEW})",
     }
@@ -601,13 +601,13 @@ def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(in_python
         ("simulation", names["runs"]),
         ("posterior", names["found"]),
         ("chains", names["found"]),
-        ("comparison", jm.compare_noise()),
+        ("comparison", jm.comparison.compare_noise()),
         ("identifiability", jm.identifiability()),
-        ("goodness", jm.goodness()),
-        ("bootstrap", jm.bootstrap()),
+        ("goodness", jm.checks.goodness()),
+        ("bootstrap", jm.checks.bootstrap()),
         ("cohort", names["cohort"]),
         ("recording", names["recording"]),
-        ("trials", jm.Trials(names["trials"])),
+        ("trials", jm.data.Trials(names["trials"])),
     ):
         figure, (mine, place) = plt.subplots(1, 2, figsize=(20.0, 12.0), layout="constrained")
         part = getattr(jm.plot, draw)(result, ax=place)

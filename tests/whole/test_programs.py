@@ -34,7 +34,7 @@ def test_gradients_by_natural_name():
 
 @pytest.mark.slow
 def test_a_users_own_muscle_has_noise_spectra_and_gradients():
-    from jaxmuscle import AbstractMuscle
+    from jaxmuscle.model import AbstractMuscle
 
     class Linear(AbstractMuscle):
         m_w: float = 0.5

@@ -97,6 +97,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import jaxmuscle as jm
+from jaxmuscle.response import sensitivity
 
 target = jm.load_target("vastus-lateralis-26mvc")
 calls = [
@@ -104,7 +105,7 @@ calls = [
     lambda number: np.asarray(jm.expected_spectrum(jm.Isometric(k_w=4e5 + number)).power).tobytes(),
     lambda number: np.asarray(jm.simulate(jm.Isometric(), number).output).tobytes(),
     lambda number: jm.ensemble(jm.Isometric(), number, seeds=16, reduce=True).mean.tobytes(),
-    lambda number: np.asarray(jm.sensitivity(jm.Isometric(k_w=4e5 + number)).power).tobytes(),
+    lambda number: np.asarray(sensitivity(jm.Isometric(k_w=4e5 + number)).power).tobytes(),
 ]
 jobs = [(call, number) for number in range(2) for call in calls]
 alone = [call(number) for call, number in jobs]

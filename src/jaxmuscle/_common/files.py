@@ -11,8 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 SYNCED_AT_ONCE = 32
 
 
@@ -94,7 +92,7 @@ def remove(folder: Path, *names: str) -> None:
 def nulled(value: Any) -> Any:
     """Nested tables, lists and arrays with None for every number that is not finite: JSON has no
     word for it."""
-    if isinstance(value, np.ndarray):
+    if hasattr(value, "tolist"):  # an array: commands that need none do not load numpy
         return nulled(value.tolist())
     if isinstance(value, dict):
         return {key: nulled(entry) for key, entry in value.items()}

@@ -40,7 +40,7 @@ def bootstrap(
     again.
 
         result = jm.fit(jm.task_for(target), target)
-        print(jm.bootstrap(result))
+        print(jm.checks.bootstrap(result))
 
     For every replicate the nonlinear simulator gives one recording for each trial, as long as its
     Welch segments ask for, analysed as the target's (a target with sigma alone: spectra drawn from

@@ -292,7 +292,7 @@ def goodness(
     refits.
 
         result = jm.fit(jm.task_for(target), target)
-        print(jm.goodness(result))
+        print(jm.checks.goodness(result))
 
     Three numbers, from the residuals `z_k = (ln(p_k / fitted_k) - bias_k - mean) / sd_k`: chi² per
     bin `Σ z_k² / (bins - 1)`, the number of runs of equal sign (few: a smooth misfit), the largest

@@ -43,7 +43,7 @@ from .recordings import (
 )
 
 if TYPE_CHECKING:
-    from jaxmuscle import PerturbedRecording, Trials
+    from jaxmuscle.data import PerturbedRecording, Trials
 
 FITTED = ("force", "torque", "displacement", "acceleration")
 VAGUE, MISSED = 0.05, 2.0  # s, standard error of a delay that is none; chi² over its expectation

@@ -102,7 +102,9 @@ def compare(
             force=force,
         )
         with told(True, f"comparing models on {aim.name}") as tell:
-            found = jm.compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
+            found = jm.comparison.compare_noise(
+                model, aim, free=names, fix=fixed, key=seed, progress=tell
+            )
         files = _write(found, output, formats_of(formats))
         record(output / "compare.json")
         _show(found)

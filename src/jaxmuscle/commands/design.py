@@ -123,7 +123,7 @@ def design(
             reads=[source],
             force=force,
         )
-        found = jm.design_input(
+        found = jm.uncertainty.design_input(
             _source(source),
             names_in(quantity, "--quantity") or (),
             rms=rms / 1e3,

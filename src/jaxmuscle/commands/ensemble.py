@@ -362,7 +362,7 @@ def swept(model: "AbstractTask", vary: list[str]) -> Any:
             raise ValueError(
                 f"--vary {entry}: give a name and numbers, as --vary k_w=4e5,5e5"
             ) from None
-    return jm.Sweep.grid(model, **values) if values else None
+    return jm.ensembles.Sweep.grid(model, **values) if values else None
 
 
 def cores(coordinator: str | None, processes: int | None) -> int | None:

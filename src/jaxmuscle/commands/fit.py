@@ -291,7 +291,9 @@ def fit(
             writable(output, "fit.json", beside=beside, reads=[*target, *hold], force=force)
             if rung is not None:
                 bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
-                options["tasks"] = {name: jm.on_rung(base, rung) for name, base in bases.items()}
+                options["tasks"] = {
+                    name: jm.model.on_rung(base, rung) for name, base in bases.items()
+                }
             converged = _fit_with_holds(*given, output, options, figures, everything=everything)
         else:
             options |= {
@@ -310,7 +312,7 @@ def fit(
             beside = [REACHED, *fit_files(output)]
             writable(output, "fit.json", beside=beside, reads=target, force=force)
             if rung is not None:
-                model = jm.on_rung(model, rung)
+                model = jm.model.on_rung(model, rung)
             converged = _fit_alone(seen, model, output, options, figures, everything=everything)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 

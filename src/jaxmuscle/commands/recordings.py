@@ -14,8 +14,7 @@ from .console import err, plain
 from .options import PERTURBED, READING
 
 if TYPE_CHECKING:
-    from jaxmuscle import PerturbedRecording, Trials
-    from jaxmuscle.data import Table
+    from jaxmuscle.data import PerturbedRecording, Table, Trials
 
 
 NO_MOTION = (
@@ -146,7 +145,7 @@ def read_with_holds(
                 " first, --hold takes the holds"
             )
     moved = read_perturbed(tables, reading, windows[: len(tables)])
-    held = jm.Trials(
+    held = jm.data.Trials(
         [
             _hold(table, reading, edges)
             for table, edges in zip(held_tables, windows[len(tables) :], strict=True)
@@ -218,7 +217,7 @@ def read_trials(
     options = {name: reading[name] for name in READING}
     if len(tables) > 1 or reading["column"] != "all":
         each = zip(tables, windows_of(window, len(tables)), strict=True)
-        return jm.Trials([read(table, options, edges) for table, edges in each])
+        return jm.data.Trials([read(table, options, edges) for table, edges in each])
     (edges,) = windows_of(window, 1)
     del options["column"], options["reference"]
     trials = jm.load_recordings(tables[0], **options)

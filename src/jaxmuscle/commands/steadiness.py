@@ -80,7 +80,7 @@ def steadiness(
             force=force,
         )
         searched = None if band is None else band_of(band)
-        found = jm.steadiness(read_trials(paths, reading, window), band=searched, mvc=mvc)
+        found = jm.data.steadiness(read_trials(paths, reading, window), band=searched, mvc=mvc)
         found.save(output / "steadiness.json")
         write_text(output / "steadiness.csv", csv_of(found.to_dataframe()))
         figures = write_figure(found.plot(), output, "steadiness", formats_of(formats))

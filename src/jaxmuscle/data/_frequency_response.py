@@ -262,8 +262,8 @@ class FrequencyResponse(Shown, eqx.Module):
         return cls(said.frequency_hz, value, stderr, said.coherence, **words)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a CSV that `jaxmuscle.load_frequency_response` reads; an existing file is replaced
-        in one step.
+        """Write a CSV that `jaxmuscle.data.load_frequency_response` reads; an existing file is
+        replaced in one step.
 
         **Raises:** `ValueError` if the path does not end in .csv.
         """

@@ -44,7 +44,7 @@ def load_frequency_response(
     """Load a dynamic stiffness over frequency, as published figures show it, from a text (.csv,
     ...) or a sheet (.xlsx).
 
-        response = jm.load_frequency_response("response.csv", segments=30)
+        response = jm.data.load_frequency_response("response.csv", segments=30)
         result = jm.fit(jm.PrescribedLength(), response)
 
         frequency_hz,gain_N/mm,phase_deg,coherence

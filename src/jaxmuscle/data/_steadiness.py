@@ -151,7 +151,7 @@ def steadiness(
     by band, regularity.
     No model is fitted.
 
-        print(jm.steadiness(jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()))
+        print(jm.data.steadiness(jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()))
 
     Everything is computed of the window of each recording (`steady()` finds it), as
     `Recording.filtered` gives it: resampled to 100 Hz and low-passed at 30 Hz.

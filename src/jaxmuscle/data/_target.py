@@ -247,7 +247,7 @@ class Target(Shown, eqx.Module):
         `jax.grad` and `jax.vmap`.
 
             target = jm.load_target("vastus-lateralis-26mvc")
-            height = jax.jit(jm.log_likelihood)
+            height = jax.jit(jm.objective.log_likelihood)
             height(jm.task_for(target), target.data())
 
         A function that is given it as an argument is compiled once for all targets with the same

@@ -368,7 +368,7 @@ def array_notices(tasks: Iterable[AbstractTask]) -> tuple[str, ...]:
         said += [
             f"{type(muscle).__name__}.{name} holds {size} numbers in arrays. The fit left them as"
             " they are: it moves single numbers, which have names. To train arrays, differentiate"
-            " jaxmuscle.log_likelihood by the task: docs/own-muscle.md, Train it"
+            " jaxmuscle.objective.log_likelihood by the task: docs/own-muscle.md, Train it"
             for name, size in sizes.items()
             if size
         ]

@@ -96,7 +96,7 @@ def fit(
     require(
         all_concrete(task),
         "task: JAX is tracing it (inside jit, grad or vmap), but a fit needs numbers. Call fit"
-        " outside; jaxmuscle.problem(task, target) has functions that JAX can transform"
+        " outside; jaxmuscle.fits.problem(task, target) has functions that JAX can transform"
         " (log_density, residuals)",
     )
     recordings = recordings_of(target, task)

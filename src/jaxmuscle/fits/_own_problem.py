@@ -59,8 +59,8 @@ class Problem(Shown):
 
     @classmethod
     def of(cls, given: FitProblem, shares: "list[np.ndarray] | None" = None) -> "Problem":
-        """For the package itself (you use `jaxmuscle.problem`): of the problem of a fit. `shares`:
-        for each target the share of each bin that the harmonic holds, if that is known."""
+        """For the package itself (you use `jaxmuscle.fits.problem`): of the problem of a fit.
+        `shares`: for each target the share of each bin that the harmonic holds, if known."""
         c = given.coordinates
         targets = [part.target for part in given.parts]
         known = all(
@@ -107,9 +107,9 @@ class Problem(Shown):
     def log_likelihood(self, theta: Theta) -> Scalar:
         """Log likelihood of the target, up to a constant.
 
-        `jaxmuscle.log_likelihood` is the same, but for a coefficient of variation: there it
-        scatters as in the task that is given, here as in the task at `start`, or at the θ of
-        `scattering_as`. So the density that a sampler draws from has one scatter.
+        `jaxmuscle.objective.log_likelihood` is the same, but for a coefficient of variation:
+        there it scatters as in the task that is given, here as in the task at `start`, or at the θ
+        of `scattering_as`. So the density that a sampler draws from has one scatter.
 
         Raises `ValueError` for a target that states neither segments nor sigma.
         """
@@ -189,7 +189,7 @@ def problem(
     """What `fit` minimises, for an optimiser or a sampler of your own: residuals, log density,
     names, start.
 
-        problem = jm.problem(task, target)
+        problem = jm.fits.problem(task, target)
         found = scipy.optimize.least_squares(jax.jit(problem.residuals), problem.start)
         problem.parameters(found.x)
 

@@ -475,7 +475,7 @@ def _with_values(task: Any, values: dict[str, Any]) -> Any:
         if np.ndim(value) > 0:
             raise ValueError(
                 f"{name} has the shape {np.shape(value)}: a parameter is one number. For several"
-                f" tasks use jaxmuscle.Sweep.grid(task, {name}=[...]), or jax.vmap"
+                f" tasks use jaxmuscle.ensembles.Sweep.grid(task, {name}=[...]), or jax.vmap"
             )
         if row is not None:
             unit = "" if row.unit == "1" else f" {row.unit}"

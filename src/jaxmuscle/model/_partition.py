@@ -25,7 +25,7 @@ def partition(
     Use it to move some parameters and to keep the others. `values` are arrays of JAX's default
     precision, in their natural units: any optimiser of pytrees (optax, optimistix) can move them.
     (`jax.grad` and `equinox.filter_grad` take a task as it is, and give a slope for every number of
-    it. `jaxmuscle.free` makes a vector without bounds of some.)
+    it. `jaxmuscle.objective.free` makes a vector without bounds of some.)
 
     **Arguments:** `task`; `names` of its parameters (`task.parameter_names` are all).
 

@@ -24,7 +24,7 @@ def rung_name(rung: int) -> str:
 def on_rung(task: AbstractTask, rung: int) -> AbstractTask:
     """The task with what measured force asks for beyond the base model, by `rung`:
 
-        task = jm.on_rung(jm.Isometric(), 2)  # with activation and a resonance
+        task = jm.model.on_rung(jm.Isometric(), 2)  # with activation and a resonance
         task["resonance_frequency"]
 
     0, as it is; 1, with an `Activation` between the nervous drive and the active tissue; 2, with a

@@ -329,7 +329,7 @@ def require_task(task: Any, example: str) -> None:
         raise ValueError(
             "task: these are several tasks in one, as jax.vmap makes them: each number has an axis"
             " in front. Give one task: inside jax.vmap it is one. For simulations of several, give"
-            " jaxmuscle.ensemble a jaxmuscle.Sweep"
+            " jaxmuscle.ensemble a jaxmuscle.ensembles.Sweep"
         )
 
 

@@ -209,7 +209,7 @@ class PrescribedLength(AbstractTask):
       over time become one by `jaxmuscle.model.Sampled.through(times, values)`
     - `muscle`, `noise`, `harmonic`, `activation`, `settings`, `initial`: the fields that all tasks
       have
-    - any other name: a parameter of the table `jaxmuscle.PARAMETERS`, as `k_w=4e5`
+    - any other name: a parameter of the table `jaxmuscle.model.PARAMETERS`, as `k_w=4e5`
 
     **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly, and for
     an x_z that is not smooth.
@@ -286,7 +286,7 @@ class Isometric(PrescribedLength):
     - `x_z` [m]: a number
     - `muscle`, `noise`, `harmonic`, `activation`, `settings`, `initial`: the fields that all tasks
       have
-    - any other name: a parameter of the table `jaxmuscle.PARAMETERS`, as `k_w=4e5`
+    - any other name: a parameter of the table `jaxmuscle.model.PARAMETERS`, as `k_w=4e5`
 
     **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly.
     """

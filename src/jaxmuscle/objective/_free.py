@@ -66,7 +66,7 @@ class Free(Shown, eqx.Module):
         normal about the task's own values. Add it to a log likelihood for the density of a
         posterior.
 
-        `jaxmuscle.problem` has one more prior, on the damping ratio.
+        `jaxmuscle.fits.problem` has one more prior, on the damping ratio.
         """
         theta = self._theta(vector)
         return self.coordinates.log_stretch(vector) - 0.5 * jnp.sum(theta**2)
@@ -92,13 +92,13 @@ def free(
 ) -> Free:
     """Some parameters of a task as a vector without bounds, and back.
 
-        free = jm.free(jm.Isometric(), ["k_w", "noise_K_w"])
+        free = jm.objective.free(jm.Isometric(), ["k_w", "noise_K_w"])
         task = free.task(free.start + 0.1)
         free.vector(task)  # 0.1, 0.1
 
     A step of 1 is about one standard deviation of the prior in every direction. So optax, samplers
     and plain gradient descent can move the vector as it is: stiffnesses of 10⁵ and amplitudes of
-    10⁻³ are of one size, and stay positive. `jaxmuscle.problem` does the same with a target.
+    10⁻³ are of one size, and stay positive. `jaxmuscle.fits.problem` does the same with a target.
 
     **Arguments:**
 

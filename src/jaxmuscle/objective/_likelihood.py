@@ -355,7 +355,7 @@ def log_likelihood(task: AbstractTask, data: Target | TargetData | Recording) ->
     """Log likelihood of measured data under a task in linear response; differentiable in the task.
 
         target = jm.load_target("vastus-lateralis-26mvc")
-        jm.log_likelihood(jm.task_for(target), target)
+        jm.objective.log_likelihood(jm.task_for(target), target)
 
     A `Target` with segments: its Welch bins are correlated gamma variables about the expected
     spectrum (docs/uncertainty.md, *The likelihood*), their unknown total integrated out; with its
@@ -394,7 +394,7 @@ def log_likelihood(task: AbstractTask, data: Target | TargetData | Recording) ->
         if np.ndim(data.log_power) != 1:
             raise ValueError(
                 f"data: these are of {len(data.log_power)} targets in one. Map over them:"
-                " jax.vmap(jaxmuscle.log_likelihood)(tasks, data), or, of one task, with"
+                " jax.vmap(jaxmuscle.objective.log_likelihood)(tasks, data), or, of one task, with"
                 " in_axes=(None, 0)"
             )
         task, data = as_arrays(task.with_parts(settings=data.settings)), _as_arrays(data)

@@ -143,7 +143,7 @@ class MonteCarlo(eqx.Module):
         return cls(linear, streams_of(key, numbers, Draws()), jnp.asarray(operator), grid, control)
 
     @property
-    def chosen(self) -> np.ndarray:
+    def chosen(self) -> Int[Array | np.ndarray, " chosen"]:
         """Positions of the compared bins among the settings'."""
         return self.linear.chosen
 

@@ -17,7 +17,8 @@ def static(curves: Any, ax: Any = None) -> tuple[Axes, Axes, Axes]:
     """Draws K(x), C(v) and force against displacement, in three axes (`ax`: three of yours).
     Returns the axes.
 
-    `curves` are the `StaticCharacteristics` that `jaxmuscle.static_characteristics(task)` returns.
+    `curves` are the `StaticCharacteristics` that `jaxmuscle.response.static_characteristics(task)`
+    returns.
 
     Thick lines are the active tissue, thin ones the passive; dashed is the slope of the force of a
     spring, dotted the operating point. In a figure of its own one legend names all lines, and

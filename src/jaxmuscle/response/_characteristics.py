@@ -91,7 +91,7 @@ def static_characteristics(
     """K(x), C(v) and force against displacement of a task's muscle, from the methods of
     `AbstractMuscle` alone.
 
-        jm.static_characteristics(jm.Isometric()).plot()
+        jm.response.static_characteristics(jm.Isometric()).plot()
 
         F_w(x) = active_force(x, 0),      F_z(x) = passive_force(0, 0, x, 0)
         K_j(x) = (F_j(x) - F_j(0)) / x

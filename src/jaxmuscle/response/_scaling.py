@@ -69,7 +69,7 @@ def at_level(
     """The task at another level of contraction, `mvc_fraction` L; as it is, it stands for
     `reference` L₀.
 
-        strong = jm.at_level(jm.Isometric(), 0.6)
+        strong = jm.response.at_level(jm.Isometric(), 0.6)
 
         P_w, F_ext ∝ L,   k_j ∝ κ(L) = resting + (1 - resting) L,   c_j ∝ κ(L)^damping
         coefficient of variation of the output ∝ g(L) = relative_variation(L)
@@ -181,7 +181,7 @@ def scaled(
 ) -> AbstractTask:
     """A geometrically similar muscle, all lengths multiplied by `size` s, under the same stress.
 
-        bigger = jm.scaled(jm.Isometric(), 1.2)
+        bigger = jm.response.scaled(jm.Isometric(), 1.2)
 
         x_ref, x_z ∝ s,   P_w, F_ext ∝ s²,   m ∝ s³,   K_0 ∝ s (k ∝ 1/s)
         C_0 ∝ s^(1 + e),   v_ref ∝ s^(1 - e)

@@ -97,7 +97,7 @@ def sensitivity(
     """How every bin of the expected spectrum answers to every parameter, by forward-mode
     differentiation.
 
-        jm.sensitivity(jm.Isometric(), ("k_w", "c_w")).plot()
+        jm.response.sensitivity(jm.Isometric(), ("k_w", "c_w")).plot()
 
     **Arguments:**
 

@@ -136,7 +136,7 @@ def standard_designs(result: FitResult, target: Target | None = None) -> tuple[D
     """The designs that `identifiability(result, target)` tries by default, to be extended or
     changed.
 
-        designs = jm.standard_designs(result)
+        designs = jm.uncertainty.standard_designs(result)
         print(jm.identifiability(result, designs=designs))
 
     The coefficient of variation and the mean (to 2 %) of the same recording, if the fit does not

@@ -67,7 +67,7 @@ def design_input(  # noqa: PLR0913 (options of a public call)
 ) -> DesignedInput:
     """The motion of the insertion, within limits, whose record makes a quantity best known.
 
-        made = jm.design_input(result, "K_w0", rms=1e-3, band=(0.5, 5.0))
+        made = jm.uncertainty.design_input(result, "K_w0", rms=1e-3, band=(0.5, 5.0))
 
     The density S_x(f) of the displacement that minimises the sum of the relative variances of the
     quantities q,
