@@ -14,7 +14,6 @@ NAMES = (
     "fit.json",
     "preset.toml",
     "target.toml",
-    "project.json",
     "target.csv",
     "study.csv",
     "study.toml",

@@ -127,7 +127,7 @@ def kind_of_file(path: str | os.PathLike[str]) -> Kind:
 
         jm.data.kind_of_file("trial.csv")
 
-    It is read for that.
+    **Arguments:** `path` of the file, which is read for that.
     """
     path = Path(path).expanduser()
     ending = path.suffix.lower()
