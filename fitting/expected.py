@@ -63,7 +63,8 @@ def levels() -> str:
         table = json.loads(
             (FOLDER / f"slifkin-newell-1999-{level}mvc.json").read_text(encoding="utf-8")
         )["values"]
-        found[level] = {name: row["value"] for name, row in table.items() if name in jm.model.PARAMETERS}
+        known = jm.model.PARAMETERS
+        found[level] = {name: row["value"] for name, row in table.items() if name in known}
     return (
         "# Written by fitting/expected.py from fitting/expected/slifkin-newell-1999-*.json.\n\n"
         + tomli_w.dumps(found)
