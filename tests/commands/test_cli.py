@@ -1068,7 +1068,7 @@ def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
         return made_comparison(target, success=success)
 
     result.save(tmp_path / "fit.json")
-    monkeypatch.setattr(jm, "compare_noise", compared)
+    monkeypatch.setattr(jm.comparison, "compare_noise", compared)
     outcome = run("compare", tmp_path / "fit.json", "--out", tmp_path / "out")
     ((task, target),) = asked
     assert_equal(target, result.target)
@@ -1337,7 +1337,7 @@ def test_how_to_play_and_fit_a_designed_motion_is_told(muscle, tmp_path, monkeyp
     longer = designed()
     once = dataclasses.replace(longer, needed=None)
     found = iter([once, longer])
-    monkeypatch.setattr(jm, "design_input", lambda *_, **__: next(found))
+    monkeypatch.setattr(jm.uncertainty, "design_input", lambda *_, **__: next(found))
     said = run("design", muscle, *ASKED, "--out", tmp_path / "out").stdout
     assert (
         "    jaxmuscle fit RECORD.csv --task prescribed-length --window 10:30 --out out/moved\n"

@@ -611,7 +611,7 @@ def test_the_command_writes_its_files(success, tmp_path, monkeypatch):
         asked.update(options, task=task, target=target)
         return made(success=success)
 
-    monkeypatch.setattr(jm, "compare_noise", compare_noise)
+    monkeypatch.setattr(jm.comparison, "compare_noise", compare_noise)
     asking = [
         "--free",
         "c_w, noise_K_z",

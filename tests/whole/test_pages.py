@@ -126,11 +126,11 @@ CALLED_OFTEN = (
     "profile",
     "posterior",
     "identifiability",
-    "compare_noise",
-    "goodness",
-    "bootstrap",
-    "design_input",
-    "sensitivity",
+    "comparison.compare_noise",
+    "checks.goodness",
+    "checks.bootstrap",
+    "uncertainty.design_input",
+    "response.sensitivity",
 )
 FEWER: dict[str, dict[str, Any]] = {
     "ensemble": {"chunk": 16},  # one program for any number of seeds
@@ -228,8 +228,10 @@ def once():
         for name, value in (("STEPS", np.array([1.2, 2.5])), ("FAR", np.log([30.0])), ("MODES", 1)):
             patch.setattr(_profile, name, value)
         patch.setattr(_half_power, "TURNS", 3)
-        for name in CALLED_OFTEN:
-            patch.setattr(jm, name, done.of(name, getattr(jm, name), **FEWER.get(name, {})))
+        for called in CALLED_OFTEN:
+            wing, _, name = called.rpartition(".")
+            home = getattr(jm, wing) if wing else jm
+            patch.setattr(home, name, done.of(name, getattr(home, name), **FEWER.get(name, {})))
         yield done
 
 
