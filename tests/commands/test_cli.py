@@ -912,7 +912,7 @@ OVERWRITES = {
         ["identifiability", "{csv}", "--segments", "9"],
         ["fit.json", "identifiability.json"],
     ),
-    "compare": ("compare_noise", ["compare", "{csv}"], ["compare.json"]),
+    "compare": ("comparison.compare_noise", ["compare", "{csv}"], ["compare.json"]),
     "reproduce": ("reproduce", ["reproduce"], ["claims.json"]),
 }
 
@@ -922,7 +922,7 @@ OVERWRITES = {
 )
 def test_an_earlier_result_is_overwritten_by_force_only(case, file, tmp_path, monkeypatch):
     work, arguments, _ = OVERWRITES[case]
-    monkeypatch.setattr(jm, work, REACHED)
+    monkeypatch.setattr(f"jaxmuscle.{work}", REACHED)
     out, path = tmp_path / "out", csv_file(tmp_path)
     arguments = [*(a.format(csv=path, out=out) for a in arguments), "--out", out]
     reached = run(*arguments)
