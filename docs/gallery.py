@@ -123,7 +123,9 @@ moved *= 1e-3 / np.std(moved)
 speed = np.gradient(moved, 1e-3)
 # a spring, damper, mass beside it
 force = held + 300.0 * moved + 6.0 * speed + 0.1 * np.gradient(speed, 1e-3)
-perturbed = jm.data.PerturbedRecording.from_array(force, moved, 1000, name="anna", window=(2.0, 60.0))
+perturbed = jm.data.PerturbedRecording.from_array(
+    force, moved, 1000, name="anna", window=(2.0, 60.0)
+)
 
 # a muscle, moved by sines from 0.1 to 5 Hz, 1 mm rms
 time, lines = np.arange(7200) / 100, np.arange(8, 361) / 72
@@ -142,7 +144,9 @@ minute = jm.data.PerturbedRecording.from_array(
 STUDY = """
 rows = []
 for i, name in enumerate(people):
-    one = jm.response.at_level(jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.3, reference=0.26)
+    one = jm.response.at_level(
+        jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.3, reference=0.26
+    )
     for j, force in enumerate(
         np.asarray(jm.ensemble(jm.settled(one), jax.random.key(i), seeds=3, duration=25.0).output)
     ):
