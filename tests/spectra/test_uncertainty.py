@@ -18,7 +18,6 @@ from jaxmuscle.objective._covariance import (
 from jaxmuscle.spectra._bin_law import (
     bin_statistics,
     log_power_moments,
-    shares_map,
     standardised,
     welch_law,
 )
@@ -269,19 +268,6 @@ def test_standardised_does_not_see_scale():
     np.testing.assert_allclose(
         standardised(7 * p, q, statistics), standardised(p, q, statistics), atol=1e-12
     )
-
-
-def test_shares_map_is_the_derivative_of_proportional_power():
-    log = np.random.default_rng(4).standard_normal(5)
-
-    def shares(log):
-        return np.exp(log) / np.exp(log).sum()
-
-    h = 1e-6
-    slopes = np.stack(
-        [(shares(log + h * e) - shares(log - h * e)) / (2 * h) for e in np.eye(5)], axis=1
-    )
-    np.testing.assert_allclose(shares_map(shares(log)), slopes, atol=h)
 
 
 def test_parameter_covariance_is_the_scatter_of_penalised_fits():

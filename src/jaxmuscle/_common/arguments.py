@@ -2,11 +2,15 @@
 right."""
 
 import importlib.util
+import inspect
 import math
 import operator
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+
+from .text import choices
 
 # of the extras that are asked for before the work begins
 EXTRAS = {"posterior": ("blackjax", "arviz_stats")}
@@ -35,6 +39,18 @@ def require_extra(extra: str) -> None:
     if missing:
         needed = " and ".join(missing).replace("_", "-")
         raise ImportError(f'{extra} needs {needed}: pip install "jaxmuscle[{extra}]"')
+
+
+def check_options(caller: Callable[..., Any], known: Any, given: Mapping[str, Any]) -> None:
+    """Raise `TypeError` for a keyword of a function that is not of the `known` ones, a
+    `TypedDict`."""
+    own = [
+        p.name for p in inspect.signature(caller).parameters.values() if p.default is not p.empty
+    ]
+    for name in given:
+        if name not in known.__optional_keys__:
+            ones = choices(name, sorted([*known.__optional_keys__, *own]))
+            raise TypeError(f"{caller.__name__}() has no option {name!r}: {ones}")
 
 
 def positive(name: str, value: Any, *, zero: bool = False) -> None:

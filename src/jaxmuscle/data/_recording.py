@@ -14,7 +14,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.arguments import is_real, require
+from jaxmuscle._common.arguments import check_options, is_real, require
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._measures import peaks, regularity
@@ -149,6 +149,7 @@ class Recording(Shown, eqx.Module):
 
         **Raises:** `ValueError` naming column, row or argument, and the remedy.
         """
+        check_options(cls.from_dataframe, ReadingOptions, options)
         return recording_of(cls, frame_table(frame), Reading(**options), name)
 
     def _checked(self, window: Any) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from typing import Any, Unpack, overload
 import numpy as np
 
 from jaxmuscle import plot
-from jaxmuscle._common.arguments import require
+from jaxmuscle._common.arguments import check_options, require
 from jaxmuscle._common.cards import Card, Shown
 from jaxmuscle._common.names import name_of_all
 from jaxmuscle._common.text import folded
@@ -163,6 +163,7 @@ def load_recordings(
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does,
     and for different units.
     """
+    check_options(load_recordings, ReadingOptions, options)
     if isinstance(paths, str | os.PathLike | Table):
         column = options.pop("column", None)
         remedy = "one file holds all trials here; name several with `columns`"

@@ -108,9 +108,7 @@ def climb(
     while waiting:
         number = waiting.pop(0)
         plan = models.plan_at(number)
-        if muscle is None:
-            moved = any(part.points is not None for part in plan.problem.parts)
-            muscle = muscle_of_response(plan.problem) if moved else {}
+        muscle = muscle_of_response(plan.problem) if muscle is None else muscle
         points, plan = _begin(plan, best or before, muscle)
         stages: list[Stage] = []
         share = DESCENDED / (models.top - models.lowest + 1)

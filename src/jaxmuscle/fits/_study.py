@@ -16,6 +16,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxmuscle import plot
+from jaxmuscle._common.arguments import check_options
 from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.cards import Card, Result, reports
 from jaxmuscle._common.environment import versions
@@ -32,7 +33,6 @@ from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_stud
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._derived import DERIVED
-from jaxmuscle.objective._options import check_options
 
 from ._cohort import CohortResult, fit_cohort
 from ._differences import CORRECTIONS, Difference, Number, change, corrected, difference, paired

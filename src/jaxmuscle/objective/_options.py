@@ -2,11 +2,10 @@
 keywords (their docstrings say what each does)."""
 
 import dataclasses
-import inspect
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, TypedDict
 
-from jaxmuscle._common.arguments import count, positive
+from jaxmuscle._common.arguments import check_options, count, positive
 from jaxmuscle._common.keys import check_key, number_of
 from jaxmuscle._common.progress import Tell, nothing
 from jaxmuscle._common.text import choices
@@ -46,18 +45,6 @@ class SimulationOptions(SearchOptions, total=False):
     seeds: int | None
     check_seeds: int | None
     rungs: int | None
-
-
-def check_options(caller: Callable[..., Any], known: Any, given: Mapping[str, Any]) -> None:
-    """Raise `TypeError` for a keyword of a function that is not of the `known` ones, a
-    `TypedDict`."""
-    own = [
-        p.name for p in inspect.signature(caller).parameters.values() if p.default is not p.empty
-    ]
-    for name in given:
-        if name not in known.__optional_keys__:
-            ones = choices(name, sorted([*known.__optional_keys__, *own]))
-            raise TypeError(f"{caller.__name__}() has no option {name!r}: {ones}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -225,14 +225,15 @@ def _answering_rows(count: int) -> Int[np.ndarray, " rows"]:
 
 def muscle_of_response(problem: FitProblem) -> dict[str, float]:
     """Values of the muscle with which the dynamic stiffness alone is fitted best, of some searches
-    and, unless these agree, of more. Nothing where that is not known: of an own muscle nobody
-    knows which parameters answer.
+    and, unless these agree, of more. Nothing where no insertion was moved, and of an own muscle, of
+    which nobody knows which parameters answer.
 
     It does not depend on what makes the muscle fluctuate: models that differ in that share it.
     """
     c = problem.coordinates
     answers = np.isin([name.partition("@")[0] for name in c.names], RESPONSE)
-    if not problem.control or not np.any(answers):
+    moved = any(part.points is not None for part in problem.parts)
+    if not (moved and problem.control and np.any(answers)):
         return {}
     spread = np.zeros((2 * sum(SEARCHES), len(c.names)))
     _spread_coefficients(problem, spread)

@@ -232,11 +232,6 @@ def standardised(
     return (z - z.mean()) / statistics.sd
 
 
-def shares_map(p: Bins) -> BinMatrix:
-    """Derivative of proportional powers with respect to log powers, `diag(p) - p pᵀ`."""
-    return np.diag(p) - np.outer(p, p)
-
-
 def sides_of(settings: SpectrumSettings) -> Bins:
     """How often a bin counts, once or for both signs of its frequency, over the rate [1/Hz]."""
     k = np.arange(settings.first_bin, settings.last_bin + 1)
