@@ -22,7 +22,7 @@ def cost_of(residuals, prior, theta):
 def told(residuals, jacobian, prior, theta, known=DETERMINED, settled=False, starts=()):
     cost = cost_of(residuals, prior, theta)
     final = Minima(theta[None], np.array([cost]), np.array([64]), np.array([settled]))
-    starts = starts or (Start(cost, False, 64, ()),)
+    starts = starts or (Start(cost, False, 64, (), "spread"),)
     return convergence(final, residuals, jacobian, np.diag(prior), theta, known, starts, 64)
 
 

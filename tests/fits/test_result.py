@@ -75,7 +75,10 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
             Rung(0, "base", -250.1, 6.5, 1.9, 0.002, False),
             Rung(1, "with activation", -260.0, 7.1, 0.9, 0.3, True),
         ),
-        "starts": (Start(1.5, True, 12, (4e5, 50 / 3)), Start(None, False, 3, ())),
+        "starts": (
+            Start(1.5, True, 12, (4e5, 50 / 3), "spread"),
+            Start(None, False, 3, (), "spread"),
+        ),
         "stretch": (np.arange(10.0, 15.0, 0.01), rng.standard_normal(500)),
         "profile": (np.linspace(0.4, 11.7, 64), rng.uniform(0, 9, 64)),
         "harmonic_p_value": 0.08,
@@ -136,7 +139,7 @@ def failed_result():
         harmonic_p_value=None,
         check={},
         seed=None,
-        starts=(Start(None, False, 0, ()),),
+        starts=(Start(None, False, 0, (), "spread"),),
     )
 
 

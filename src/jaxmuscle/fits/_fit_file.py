@@ -9,7 +9,6 @@ from msgspec import Meta
 from jaxmuscle._common.documents import Table, says
 from jaxmuscle._common.keys import SEEDS
 from jaxmuscle.objective._options import METHODS
-from jaxmuscle.objective._starts import SPREAD
 
 FORMAT = 5
 ADEQUATE = 0.01  # p of the verdict from which on a model describes the data
@@ -101,9 +100,7 @@ class Start(Table):
             " where that is not finite"
         ),
     ]
-    kind: Annotated[
-        str, says("How it began, see *Starts* in docs/fitting.md", missing="`spread`")
-    ] = SPREAD
+    kind: Annotated[str, says("How it began, see *Starts* in docs/fitting.md")]
 
 
 class CorrelationTable(Table, kw_only=True):

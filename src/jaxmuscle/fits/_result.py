@@ -24,6 +24,7 @@ from jaxmuscle._common.text import choices, probability
 from jaxmuscle.data._measure import Measure
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._derived import MEAN, derived_names
 
 from ._fit_file import FORMAT, Adequacy, FitTable, PartTable, Rung, Start
@@ -53,6 +54,7 @@ WHAT_TO_DO = (
     " all fits so far"
 )
 PROFILE = ("frequency_hz", "chi2_rise")
+PRIOR = ("prior_centre", "prior_sd")
 
 
 class FitResult(Result, eqx.Module):
@@ -380,9 +382,13 @@ def load_result(path: str | Path) -> FitResult:
             f"{path}: is not a fit result of format {FORMAT}: fit again, FitResult.save writes it"
         )
     try:
-        return _from_table(table, str(path))
+        result = _from_table(table, str(path))
+        missing = _missing(result, table)
     except (ValueError, ArithmeticError) as error:
         raise error if isinstance(error, ResultError) else ResultError(f"{path}: {error}") from None
+    if missing:
+        raise ResultError(f"{path}: the key {missing} is missing: fit again")
+    return result
 
 
 def _from_table(table: dict[str, Any], file: str) -> FitResult:
@@ -428,4 +434,25 @@ def _from_table(table: dict[str, Any], file: str) -> FitResult:
         seed=said.seed,
         settings=table["settings"],
         versions=said.versions,
+    )
+
+
+def _missing(result: FitResult, table: dict[str, Any]) -> str | None:
+    """A key that is not there though the rest of the file asks for it, where the schema leaves keys
+    free; None if there is none."""
+    settings, known = result.settings, set(map(base_of, result.parameters))
+    of = result.correlation
+    spectra = [settings["spectrum"]] if len(result.parts) == 1 else settings["spectrum"].values()
+    wanted = [
+        ("parameters", {n for task in result.tasks.values() for n in task.parameter_names}, known),
+        ("per_newton", set(result.per_newton), table["per_newton"]),
+        ("correlation", {"parameters", "matrix"} if of else set(), of),
+        *((f"settings.{name}", set(result.free), settings[name]) for name in PRIOR),
+        *(
+            ("settings.spectrum", set(target.settings.to_dict()), used)
+            for target, used in zip(result.targets.values(), spectra, strict=True)
+        ),
+    ]
+    return next(
+        (f"{at}.{min(names - {*has})}" for at, names, has in wanted if names - {*has}), None
     )
