@@ -229,7 +229,7 @@ def rows() -> list[Row]:
 def _compare(
     name: str, target: jm.Target, noise: Float[np.ndarray, "seeds points channels"]
 ) -> list[Row]:
-    task = jm.task_for(target)
+    task = target.task()
     check(task, noise)
     ends: dict[str, Any] = {}
     programs = {

@@ -64,7 +64,7 @@ def truth(number: int) -> jm.model.AbstractTask:
 def recorded(task: jm.model.AbstractTask, number: int, seconds: float) -> jm.Target:
     """One recording of it, by the nonlinear simulator, as a target."""
     key = jax.random.fold_in(jax.random.key(41), number)
-    runs = jm.ensemble(jm.settled(task), key, seeds=1, duration=START + seconds, control=False)
+    runs = jm.ensemble(task.settled(), key, seeds=1, duration=START + seconds, control=False)
     settings, window = task.settings, (START, START + seconds)
     power = np.asarray(runs.spectrum(settings, window).proportional)[0]
     held = runs.filtered(settings, window)[0]

@@ -67,7 +67,7 @@ def recorded(colour: str, number: int, seconds: float, *, harmonic: bool) -> Rec
         )
     truth = task.replace(**(drawn if harmonic else drawn | {"harmonic_amplitude": 0.0}))
     runs = jm.ensemble(
-        jm.settled(truth),
+        truth.settled(),
         jax.random.key(COLOURS.index(colour)),
         seeds=np.array([2 * number + harmonic]),
         duration=SETTLING + seconds,

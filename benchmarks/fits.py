@@ -31,7 +31,7 @@ def fits() -> list[Row]:
         print(f"{name:<32}", end="", flush=True)
         target = jm.load_target(name)
         for noise in NOISES:
-            task = jm.task_for(target, noise=noise)
+            task = target.task(noise=noise)
             jm.fit(task, target)
             start = time.perf_counter()
             result = jm.fit(task, target)
@@ -61,7 +61,7 @@ def starts(repetitions: int) -> list[Row]:
     for name in TARGETS:
         with jax.enable_x64(True):
             target = jm.load_target(name)
-            problem = planned(jm.task_for(target), target, FitOptions()).problem
+            problem = planned(target.task(), target, FitOptions()).problem
             points = starting_points(problem, STARTS)
             program = lambda s=problem, p=points: least_squares(s.linear(), p, MAX_STEPS)  # noqa: E731
             wall, busy = (
@@ -87,7 +87,7 @@ def posterior() -> list[Row]:
     """Four chains for the first target, the second of two calls; the worst R-hat of what is
     determined."""
     target = jm.load_target("vastus-lateralis-26mvc")
-    result = jm.fit(jm.task_for(target), target)
+    result = jm.fit(target.task(), target)
     for key in (1, 2):
         begun = time.perf_counter()
         found = jm.posterior(result, target, key=key)

@@ -219,7 +219,7 @@ def amplitude(count: int) -> None:
             f" {agreement(rms)}",
             flush=True,
         )
-    for words, task in (("default, 2.2 N", TASK), ("carried to 40 N", jm.at_force(TASK, 40.0))):
+    for words, task in (("default, 2.2 N", TASK), ("carried to 40 N", TASK.at_force(40.0))):
         for band in (2.0, 5.0):
             for rms in (0.1e-3, 0.3e-3, 1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 8e-3):
                 (off, _, size, f), mean = described(task, rms, np.random.default_rng(2), band)
@@ -365,7 +365,7 @@ def _simulated(
         phase = rng.uniform(0, 2 * np.pi, lines.size)
         length = np.cos(2 * np.pi * np.outer(time, lines / 60) + phase).sum(axis=1)
         length *= 1e-3 / np.std(length)
-        moved = jm.settled(muscle).with_parts(x_z=jm.model.Sampled.through(time, -length))
+        moved = muscle.settled().with_parts(x_z=jm.model.Sampled.through(time, -length))
         force = np.asarray(jm.simulate(moved, seed, duration=90.0, rate=float(rate)).output)
         runs.append(jm.data.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0)))
     return runs
@@ -535,7 +535,7 @@ def time(count: int) -> None:
     given = {
         "moved": (TASK, moved),
         "held": (jm.Isometric(), held.force),
-        "spectrum": (jm.task_for(spectrum), spectrum),
+        "spectrum": (spectrum.task(), spectrum),
     }
     taken = timed({name: lambda pair=pair: jm.fit(*pair) for name, pair in given.items()}, count)
     for name, found in taken.items():

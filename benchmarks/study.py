@@ -70,7 +70,7 @@ def population(
 def recorded(tasks: dict[str, jm.Isometric], trials: int, key: int, folder: Path) -> Path:
     """The files of a study and its table."""
     rows = ["file,person,group,trial"]
-    sweep = jm.ensembles.Sweep.of([jm.settled(task) for task in tasks.values()])
+    sweep = jm.ensembles.Sweep.of([task.settled() for task in tasks.values()])
     for number, (name, task) in enumerate(zip(tasks, sweep, strict=True)):
         runs = jm.ensemble(
             task,

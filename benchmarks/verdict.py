@@ -37,7 +37,7 @@ def recordings(
     """Forces of the settled nonlinear model at 100 Hz, and the window with so many segments."""
     window = (LEAD, LEAD + (SETTINGS.length + (segments - 1) * SETTINGS.step) / SETTINGS.rate)
     runs = jm.ensemble(
-        jm.settled(task), jax.random.key(key), seeds=count, duration=window[1], control=False
+        task.settled(), jax.random.key(key), seeds=count, duration=window[1], control=False
     )
     return np.asarray(runs.output), window
 

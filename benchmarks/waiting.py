@@ -13,10 +13,7 @@ import numpy as np
 from measure import Row
 
 IMPORTS = "import jax, diffrax, optimistix, matplotlib.pyplot, scipy.signal"
-FIT = (
-    "import jaxmuscle as jm; t = jm.load_target('vastus-lateralis-26mvc');"
-    " jm.fit(jm.task_for(t), t)"
-)
+FIT = "import jaxmuscle as jm; t = jm.load_target('vastus-lateralis-26mvc'); jm.fit(t.task(), t)"
 TARGET = "vastus-lateralis-26mvc"
 # The first fit of one's own data, with an empty cache: file, options, most times the imports. Data
 # from outside the model: filtered noise, and a spring, a damper and a mass that a motor moves.

@@ -4,10 +4,10 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files
 
-import jaxmuscle as jm
+from jaxmuscle import explorer
 
 
 def on_files(files: Files, config: Any) -> Files:
     """Adds the page."""
-    files.append(File.generated(config, "explorer-page.html", content=jm.explorer.page()))
+    files.append(File.generated(config, "explorer-page.html", content=explorer.page()))
     return files

@@ -67,7 +67,7 @@ import jaxmuscle as jm
 
 key = jax.random.key(0)
 target = jm.load_target("vastus-lateralis-26mvc")
-result = jm.fit(jm.task_for(target), target)
+result = jm.fit(target.task(), target)
 """
 SIMULATED = """
 runs = jm.ensemble(result.task, key, seeds=200)
@@ -85,11 +85,11 @@ refits = jm.checks.bootstrap(result)
 PEOPLE = """
 import numpy as np
 
-held = jm.simulate(jm.settled(result.task), key, duration=40.0, rate=1000.0).output
+held = jm.simulate(result.task.settled(), key, duration=40.0, rate=1000.0).output
 ramp = np.linspace(0.0, float(held[0]), 3000)
 np.savetxt("trial.csv", np.concatenate([ramp, held, ramp[::-1]]), header="force", comments="")
 recording = jm.load_recording("trial.csv", column="force", rate=1000, units="N")
-seeds = jm.ensemble(jm.settled(result.task), key, seeds=5, duration=20.0)
+seeds = jm.ensemble(result.task.settled(), key, seeds=5, duration=20.0)
 trials = [
     jm.Recording(force, seeds.rate, name=f"trial {i}")
     for i, force in enumerate(np.asarray(seeds.output))
@@ -97,8 +97,10 @@ trials = [
 
 people = {}
 for i, name in enumerate(["ann", "ben", "eve", "jim", "kim", "tom"]):
-    one = jm.response.at_level(
-        jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.2 + 0.1 * i, reference=0.26
+    one = (
+        jm.Isometric()
+        .replace(noise_K_w=0.12 + 0.04 * (i % 2))
+        .at_level(0.2 + 0.1 * i, reference=0.26)
     )
     power = np.asarray(
         jm.ensemble(one, jax.random.key(i), seeds=6).spectrum().mean().proportional, float
@@ -116,7 +118,7 @@ MOVED = """
 import numpy as np
 import scipy.signal
 
-held = np.asarray(jm.simulate(jm.settled(result.task), key, duration=60.0, rate=1000.0).output)
+held = np.asarray(jm.simulate(result.task.settled(), key, duration=60.0, rate=1000.0).output)
 low = scipy.signal.butter(4, 5.0, fs=1000.0, output="sos")
 moved = scipy.signal.sosfilt(low, np.random.default_rng(0).standard_normal(held.size))
 moved *= 1e-3 / np.std(moved)
@@ -144,11 +146,9 @@ minute = jm.data.PerturbedRecording.from_array(
 STUDY = """
 rows = []
 for i, name in enumerate(people):
-    one = jm.response.at_level(
-        jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.3, reference=0.26
-    )
+    one = jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)).at_level(0.3, reference=0.26)
     for j, force in enumerate(
-        np.asarray(jm.ensemble(jm.settled(one), jax.random.key(i), seeds=3, duration=25.0).output)
+        np.asarray(jm.ensemble(one.settled(), jax.random.key(i), seeds=3, duration=25.0).output)
     ):
         np.save(f"{name}-{j}.npy", force)
         rows.append(
@@ -367,7 +367,7 @@ SECTIONS = (
             ),
             Shown(
                 "gallery/joint.png",
-                "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",
+                "jm.fit(pair, {name: people[name] for name in pair}).plot()",
                 "Two measurements fitted together",
                 "identifiability.md#a-joint-fit",
             ),
@@ -412,7 +412,7 @@ SECTIONS = (
     ),
     Section(
         "The paper's figures",
-        '\njm.reproduce("paper")\n',
+        '\nfrom jaxmuscle import paper\n\npaper.reproduce("paper")\n',
         tuple(
             Shown(f"gallery/paper-{name}.png", "", words, "reproduce.md")
             for name, words in PAPER.items()

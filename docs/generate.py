@@ -96,7 +96,7 @@ FILES_HEAD = """# Files, key by key
 
 Look here if you write one of these files by hand, or read one with your own program. For each kind of file there is
 a table of its keys. The fields of [`SpectrumSettings`](spectra.md) and of a task have pages of their own and are not
-repeated here. Let `save_preset` write the table of a task.
+repeated here. Let `task.save` write the table of a task.
 
 **Columns.** *If missing* says what a file means that lacks the key; *error* means that such a file is refused. *Since* is
 the first version of the format that has the key. Presets of format 1 are read, too.
@@ -117,7 +117,7 @@ FIT_FILE = """JSON, format 5. `FitResult.save` writes it and `load_result` reads
 the keys of the second table stand under `parts`, by the name of the target. What the file says twice must agree: the
 value of a parameter with the `task_table`, the spectrum with the `target_table`. What was measured without the model
 stands under `measured` in the `target_table`. Earlier formats are not read: fit again."""
-PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
+PRESET = """TOML, format 2. `task.save` writes it and `load_preset` reads it. The `task_table` has every field of
 the task and of its parts. `type` is the class of a part. What a task does not have (`activation`; `initial`, the state
 from which a simulation begins; in its spectrum settings `filter_cutoff`, the low-pass) is written as `"none"`. Format 1
 has no key `format`, and may leave out what a task does not have."""

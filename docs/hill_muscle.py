@@ -346,7 +346,7 @@ def _draw_spectra(ax, seeds):
         ),
     }
     for name, (noise, colour) in noises.items():
-        task = jm.settled(held_task(noise=noise, harmonic=jm.Harmonic(0.01)))
+        task = held_task(noise=noise, harmonic=jm.Harmonic(0.01)).settled()
         expected = jm.expected_spectrum(task)
         seen = jm.ensemble(task, jax.random.key(0), seeds=seeds, control=False).mean_spectrum()
         ax.plot(expected.frequency, expected.power, color=colour, label=name)

@@ -8,7 +8,7 @@ NAME = "slifkin-newell-1999-95mvc"
 
 def fit(target: jm.Target, seed: int = 0) -> jm.fits.FitResult:
     """All default parameters free, band-limited noise."""
-    return jm.fit(jm.task_for(target), target, key=seed, rungs=0)  # the model of the paper
+    return jm.fit(target.task(), target, key=seed, rungs=0)  # the model of the paper
 
 
 if __name__ == "__main__":

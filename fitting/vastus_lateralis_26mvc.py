@@ -8,7 +8,7 @@ NAME = "vastus-lateralis-26mvc"
 
 def fit(target: jm.Target, seed: int = 0) -> jm.fits.FitResult:
     """All default parameters free, band-limited noise."""
-    return jm.fit(jm.task_for(target), target, key=seed)
+    return jm.fit(target.task(), target, key=seed)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ hand; noise amplitudes and harmonic frequency are the paper's and stay fixed.
 
 import jaxmuscle as jm
 from common import arguments, distance, load, report, rounded
-from jaxmuscle import save_preset
 
 NAME = "zagrodny-fig4a"
 OTHER = "slifkin-newell-1999-95mvc"
@@ -55,4 +54,4 @@ if __name__ == "__main__":
             "rms_log_distance": {NAME: round(near, 3), OTHER: round(far, 3)},
             "jaxmuscle": result.versions["jaxmuscle"],
         }
-        save_preset(options.preset, task, description=description, fit=made)
+        task.save(options.preset, description=description, fit=made)

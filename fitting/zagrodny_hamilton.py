@@ -12,7 +12,6 @@ keeps it smaller.
 
 import jaxmuscle as jm
 from common import arguments, distance, load, report, rounded
-from jaxmuscle import save_preset
 
 NAME = "hamilton-2004"
 BESIDE = "zagrodny-slifkin"
@@ -56,4 +55,4 @@ if __name__ == "__main__":
             "harmonic_over_zagrodny_slifkin": round(ratio, 3),
             "jaxmuscle": result.versions["jaxmuscle"],
         }
-        save_preset(options.preset, task, description=description, fit=made)
+        task.save(options.preset, description=description, fit=made)

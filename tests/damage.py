@@ -234,7 +234,7 @@ def formats(folder: Path, result: jm.fits.FitResult) -> list[Format]:
     grid = 0.390625 * np.arange(1, 31)
     power = 1 / (1 + (grid / 1.2) ** 2) + 0.01
     result.save(folder / "valid.json")
-    jm.save_preset(folder / "valid.toml", result.task, description="a preset")
+    result.task.save(folder / "valid.toml", description="a preset")
     target = jm.Target(
         "made",
         power,

@@ -5,7 +5,6 @@ from . import checks as checks
 from . import comparison as comparison
 from . import data as data
 from . import ensembles as ensembles
-from . import explorer as explorer
 from . import fits as fits
 from . import model as model
 from . import objective as objective
@@ -26,7 +25,6 @@ from .data._trials import load_recordings as load_recordings
 from .ensembles._ensemble import ensemble as ensemble
 from .fits._cohort import fit_cohort as fit_cohort
 from .fits._fit import fit as fit
-from .fits._joint import fit_joint as fit_joint
 from .fits._result import load_result as load_result
 from .fits._study import run_study as run_study
 from .model._activation import Activation as Activation
@@ -41,13 +39,8 @@ from .model._tasks import PrescribedMotion as PrescribedMotion
 from .model._white_noise import BandLimitedNoise as BandLimitedNoise
 from .model._white_noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
 from .model._white_noise import WhiteNoise as WhiteNoise
-from .objective._arguments import task_for as task_for
-from .paper._reproduce import reproduce as reproduce
 from .response._expected_spectrum import expected_spectrum as expected_spectrum
-from .response._linearised import settled as settled
 from .response._presets import load_preset as load_preset
-from .response._presets import save_preset as save_preset
-from .response._scaling import at_force as at_force
 from .simulation._simulate import simulate as simulate
 from .spectra._settings import SpectrumSettings as SpectrumSettings
 from .uncertainty._identifiability import identifiability as identifiability

@@ -81,7 +81,7 @@ def public_calls(key):
         "sweep": lambda: jm.ensemble(jm.ensembles.Sweep.grid(task, k_w=[4e5, 5e5]), key, seeds=2),
         "store": lambda: jm.ensemble(task, key, seeds=2, store="never.zarr"),
         "fit": lambda: jm.fit(task, target, key=key),
-        "fit_joint": lambda: jm.fit_joint({"a": target}, key=key),
+        "fit of several": lambda: jm.fit(None, {"a": target}, key=key),
         "Monte Carlo": lambda: jm.fit(task, target, key=key, method="montecarlo"),
         "fit_cohort": lambda: jm.fit_cohort([target], key=key),
         "posterior": lambda: jm.posterior(result, key=key),

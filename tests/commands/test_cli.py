@@ -265,7 +265,7 @@ def test_a_preset_with_a_mean_force_is_simulated_at_it(tmp_path):
     """The same random numbers: the force of every instant is multiplied by the ratio of the
     means."""
     preset, found = tmp_path / "anna.toml", []
-    jm.save_preset(preset, jm.Isometric())
+    jm.Isometric().save(preset)
     table = preset.read_text()
     expected = float(
         expected_moments(as_arrays(jm.Isometric()), jm.SpectrumSettings(), WINDOW)[0].mean
@@ -328,7 +328,7 @@ def test_a_moved_insertion_is_simulated(tmp_path):
         "noise_C_z": 0.0,
     }
     task = jm.PrescribedLength(x_z=jm.model.SmoothStep(-0.004, 6.0, 1.0)).replace(**quiet)
-    jm.save_preset(tmp_path / "moved.toml", task)
+    task.save(tmp_path / "moved.toml")
     arguments = ["--task", "prescribed-length", "--seeds", 4, "--json", "--out", tmp_path]
     found = strict(run("simulate", tmp_path / "moved.toml", *arguments).stdout)
     assert found["task"] == "PrescribedLength" and found["quantity"] == "F_ext"
@@ -1285,7 +1285,7 @@ def designed():
 @pytest.fixture
 def muscle(tmp_path):
     preset = tmp_path / "muscle.toml"
-    jm.save_preset(preset, jm.Isometric())
+    jm.Isometric().save(preset)
     return preset
 
 

@@ -95,7 +95,7 @@ def here(tmp_path, monkeypatch):
         "target,group\nfdi-abduction-45mvc,a\nvastus-lateralis-26mvc,b\n"
     )
     (folder / "study.csv").write_text(f"file,person\n{folder}/trial.csv,a\n{folder}/moved.csv,b\n")
-    jm.save_preset(folder / "preset.toml", jm.Isometric())
+    jm.Isometric().save(folder / "preset.toml")
     made_result().save(folder / "fit.json")
     yield folder
     jax.config.update("jax_compilation_cache_dir", before[0])

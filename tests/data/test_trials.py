@@ -461,7 +461,7 @@ def test_drawn_with_its_trials():
 def people(task, seeds, key):
     """Trials of 15 s of the nonlinear model."""
     runs = jm.ensemble(
-        jm.settled(task), jax.random.key(key), seeds=seeds, duration=20.0, dt=2.5e-3, control=False
+        task.settled(), jax.random.key(key), seeds=seeds, duration=20.0, dt=2.5e-3, control=False
     )
     return [
         jm.Recording(x, runs.rate, window=(5.0, 20.0), name=f"trial{i}")
@@ -471,7 +471,7 @@ def people(task, seeds, key):
 
 @pytest.fixture(scope="module")
 def strong():
-    task = jm.at_force(jm.Isometric(), 40.5)
+    task = jm.Isometric().at_force(40.5)
     found = people(task, 5, 11)
     with without_intervals():
         return found, jm.fit(jm.Isometric(), found, rungs=0, seeds=0, check_seeds=0, starts=8)
@@ -527,13 +527,13 @@ def test_profile_and_reopening_keep_the_mean(strong):
 
 def test_a_joint_fit_at_two_forces():
     """One muscle at two drives: stiffness is shared, every P_w follows its own mean."""
-    weak = jm.at_force(jm.Isometric(), 20.0)
+    weak = jm.Isometric().at_force(20.0)
     found = {
         "weak": people(weak, 3, 12),
         "strong": people(weak.replace(P_w=1.5 * weak["P_w"]), 3, 13),
     }
     with without_intervals():
-        result = jm.fit_joint(found, starts=8, seeds=0)
+        result = jm.fit(None, found, starts=8, seeds=0)
     assert {"P_w@weak", "P_w@strong"} <= set(result.free) and "k_w" in result.free
     for name, recordings in found.items():
         measured = np.mean([np.mean(r.samples) for r in recordings])

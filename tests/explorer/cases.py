@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 import jaxmuscle as jm
+from jaxmuscle import explorer
 from jaxmuscle.explorer._facts import bare_table, facts
 from jaxmuscle.explorer._page import MODULES, part_of
 from jaxmuscle.model import Constant, Decay, RampHold, WhiteNoise
@@ -134,7 +135,7 @@ def expected(task: Any) -> dict[str, Any]:
 def by_javascript(cases: dict[str, Any]) -> dict[str, float]:
     """The largest relative difference of a bin, the mean or the variance in every structure, as
     node finds it."""
-    folder = Path(jm.explorer.__file__).parent / "page"
+    folder = Path(explorer.__file__).parent / "page"
     done = subprocess.run(
         ["node", CHECK, folder],
         input=json.dumps(cases),

@@ -19,6 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
+from jaxmuscle import explorer
 from jaxmuscle.commands.main import app
 from jaxmuscle.explorer._facts import facts
 from jaxmuscle.explorer._page import MODULES, part_of
@@ -26,7 +27,7 @@ from jaxmuscle.model import TASKS, AbstractLaw
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised
 
 STORED = json.loads(cases.TABLE.read_text(encoding="utf-8"))
-FOLDER = Path(jm.explorer.__file__).parent / "page"
+FOLDER = Path(explorer.__file__).parent / "page"
 AGAIN = "run `python tests/explorer/cases.py`"
 # Rounding in float64: linear algebra of another library, in bins that hold 1e-8 of the power.
 ROUNDING = 1e-7
@@ -86,7 +87,7 @@ def test_a_fault_is_noticed():
 
 
 def test_the_page_is_one_file_that_asks_for_nothing():
-    page = jm.explorer.page()
+    page = explorer.page()
     assert not re.search(r"https?:|//\w+\.\w|@import|url\((?!#)|fetch\(|XMLHttpRequest|src=", page)
     assert not re.search(r"^(import|export) ", page, re.MULTILINE) and "/*" not in page.replace(
         "/*JS", ""
@@ -141,11 +142,11 @@ class Toe(AbstractLaw):
 
 def test_what_the_page_does_not_know_is_refused():
     with pytest.raises(ValueError, match="of its own"):
-        jm.explorer.page(jm.Isometric(muscle=jm.Muscle(stiffness_z=Toe())))
+        explorer.page(jm.Isometric(muscle=jm.Muscle(stiffness_z=Toe())))
     with pytest.raises(ValueError, match="P_w is a Decay"):
-        jm.explorer.page(jm.Isometric(P_w=jm.model.Decay()))
+        explorer.page(jm.Isometric(P_w=jm.model.Decay()))
     with pytest.raises(jm.errors.OperatingPointError):
-        jm.explorer.page(jm.Isometric().replace(c_w=0.0, c_z=0.0))
+        explorer.page(jm.Isometric().replace(c_w=0.0, c_z=0.0))
 
 
 # --- the command
@@ -187,7 +188,7 @@ def test_command_writes_what_it_was_given(tmp_path, monkeypatch):
     answer = explore("nowhere", "--out", page, "--force", "--no-open")
     assert answer.exit_code == 2 and "Traceback" not in answer.output
     found = explore("--no-open", "--json")
-    assert Path(json.loads(found.stdout)["page"]).read_text(encoding="utf-8") == jm.explorer.page()
+    assert Path(json.loads(found.stdout)["page"]).read_text(encoding="utf-8") == explorer.page()
 
 
 # --- in a browser
@@ -210,7 +211,7 @@ def page(browser, tmp_path):
     but files and data."""
     target = jm.load_target(TARGET)
     path = tmp_path / "page.html"
-    path.write_text(jm.explorer.page(jm.task_for(target), target), encoding="utf-8")
+    path.write_text(explorer.page(target.task(), target), encoding="utf-8")
     browser.screen(1280, 900)
     browser.open(path.as_uri())
     yield browser
@@ -260,7 +261,7 @@ def test_sliders_move_the_spectrum_as_in_python(page, x64):
     """With keys alone: the arrows of a focused slider, the Tab key to the number beside it,
     undo."""
     target = jm.load_target(TARGET)
-    task = jm.task_for(target)
+    task = target.task()
     before = power_in(page)
     np.testing.assert_allclose(before, jm.expected_spectrum(task).power, rtol=SAME)
     assert page.run("window.explorer.spectrum.chi2") == pytest.approx(
@@ -310,7 +311,7 @@ def test_a_dropped_spectrum_is_shown_and_compared(page, tmp_path, x64):
             page.run("document.querySelectorAll('#figure circle.datum').length")
             >= 2 * target.bins.size
         )
-        task = jm.task_for(target)
+        task = target.task()
         assert page.run("window.explorer.spectrum.chi2") == pytest.approx(
             chi2_of(task, target), rel=SAME
         )
@@ -346,7 +347,7 @@ def test_the_saved_preset_and_the_link_hold_what_is_seen(page, tmp_path, x64):
     np.testing.assert_allclose(seen, jm.expected_spectrum(task).power, rtol=SAME)
     url = page.run("location.href")
     empty = tmp_path / "empty.html"
-    empty.write_text(jm.explorer.page(), encoding="utf-8")
+    empty.write_text(explorer.page(), encoding="utf-8")
     page.open(empty.as_uri() + "#" + url.partition("#")[2])
     np.testing.assert_array_equal(power_in(page), seen)
     assert page.run("document.getElementById('target-name').textContent") == TARGET

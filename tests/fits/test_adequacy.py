@@ -307,13 +307,13 @@ def test_one_criterion_for_a_parameter_and_for_what_is_the_same_number():
 
 def test_a_mean_force_that_nothing_can_reach_is_refused():
     with pytest.raises(
-        ValueError, match=r"mean_force = 120 N cannot be reached.*P_w = 5 N.*at_force\(task, 120\)"
+        ValueError, match=r"mean_force = 120 N cannot be reached.*P_w = 5 N.*task\.at_force\(120\)"
     ):
         jm.fit(TASK, drawn(12, 1), mean_force=(120.0, 3.0))
 
 
 def test_a_mean_force_in_newtons_is_met_by_the_carried_muscle():
-    task = jm.at_force(TASK, 120.0)
+    task = TASK.at_force(120.0)
     result = jm.fit(task, drawn(12, 1), mean_force=(120.0, 1.0), **QUICK)
     assert result.adequate and result.derived["model_mean"].value == pytest.approx(120.0, abs=2.0)
     assert abs(result.only.further["mean"]) < 2 and result.per_newton == {}

@@ -45,7 +45,7 @@ def people():
     targets = []
     for number in range(PEOPLE):
         runs = jm.ensemble(
-            jm.settled(person(number)),
+            person(number).settled(),
             jax.random.key(100 + number),
             seeds=SEEDS,
             dt=2.5e-3,
@@ -101,7 +101,7 @@ def test_what_the_data_determine_is_recovered():
 
 def test_each_target_is_fitted_as_if_alone():
     with without_intervals():
-        alone = jm.fit(jm.task_for(people()[3]), people()[3], starts=16, check_seeds=0, rungs=0)
+        alone = jm.fit(people()[3].task(), people()[3], starts=16, check_seeds=0, rungs=0)
     together = cohort().results["person3"]
     for name, estimate in alone.derived.items():
         if estimate.stderr is not None:

@@ -558,17 +558,17 @@ def test_stiff_points_get_substeps(x64):
 
 
 def test_the_task_follows_from_the_quantity():
-    force = jm.task_for(VASTUS)
+    force = VASTUS.task()
     assert isinstance(force, jm.Isometric) and force.settings == VASTUS.settings
-    assert isinstance(jm.task_for(simple_target(quantity="torque")), jm.Isometric)
-    moved = jm.task_for(simple_target(quantity="displacement"), noise="ornstein-uhlenbeck")
+    assert isinstance(simple_target(quantity="torque").task(), jm.Isometric)
+    moved = simple_target(quantity="displacement").task(noise="ornstein-uhlenbeck")
     assert isinstance(moved, jm.PrescribedForce) and isinstance(
         moved.noise, jm.OrnsteinUhlenbeckNoise
     )
     felt = simple_target(quantity="acceleration")
-    assert moved.quantity == "displacement" and jm.task_for(felt).quantity == "acceleration"
-    assert jm.task_for(felt, jm.PrescribedForce).quantity == "acceleration"
-    assert isinstance(jm.task_for(felt, jm.PrescribedMotion), jm.PrescribedMotion)
+    assert moved.quantity == "displacement" and felt.task().quantity == "acceleration"
+    assert felt.task(jm.PrescribedForce).quantity == "acceleration"
+    assert isinstance(felt.task(jm.PrescribedMotion), jm.PrescribedMotion)
 
 
 def test_an_acceleration_is_fitted_as_one():
@@ -581,9 +581,9 @@ def test_an_acceleration_is_fitted_as_one():
     with pytest.raises(
         ValueError, match="target 'hump' is a force, but its task PrescribedForce gives a_z in m/s"
     ):
-        jm.fit(jm.task_for(felt), simple_target(), free=free)
+        jm.fit(felt.task(), simple_target(), free=free)
     with pytest.raises(ValueError, match="the mean of an acceleration is zero; leave it out"):
-        jm.fit(jm.task_for(felt), felt, free=free, mean_force=(1.0, 0.1))
+        jm.fit(felt.task(), felt, free=free, mean_force=(1.0, 0.1))
 
 
 def test_white_noise_works_where_the_output_does_not_contain_it():
@@ -654,9 +654,13 @@ def test_bad_arguments_are_named(arguments, message):
 def test_an_unknown_option_is_named_with_the_nearest(function, given, message):
     with pytest.raises(TypeError, match=message):
         function(jm.Isometric(), simple_target(), **{given: 1})
-    for other, first in ((jm.fit_cohort, []), (jm.fit_joint, {}), (jm.run_study, "study.csv")):
+    for other, given in (
+        (jm.fit_cohort, ([],)),
+        (jm.fit, (None, {})),
+        (jm.run_study, ("study.csv",)),
+    ):
         with pytest.raises(TypeError, match="has no option 'sedes'"):
-            other(first, sedes=1)
+            other(*given, sedes=1)
 
 
 def test_a_task_that_does_not_fluctuate():
@@ -689,7 +693,7 @@ def averaged(task, *, seeds=192, key=99):
     """The target that averaging the absolute spectra of many seeds gives; none of them is used by
     the fit."""
     # the program of a fit's check
-    runs = jm.ensemble(jm.settled(task), jax.random.key(key), seeds=seeds, chunk=64)
+    runs = jm.ensemble(task.settled(), jax.random.key(key), seeds=seeds, chunk=64)
     power = np.asarray(runs.spectrum().mean().proportional)
     return jm.Target("truth", power, segments=[6] * seeds)
 
@@ -698,7 +702,7 @@ def true_derived(task):
     """Derived quantities of the truth, its spectrum with a control variate: each seed is worth
     hundreds."""
     runs, quiet = (
-        jm.ensemble(jm.settled(t), jax.random.key(7), seeds=64)
+        jm.ensemble(t.settled(), jax.random.key(7), seeds=64)
         for t in (task, references.quiet(task))
     )
     line = quiet.spectrum().power[0]
@@ -1006,7 +1010,7 @@ def test_controlled_moments_are_those_of_a_controlled_ensemble(x64):
     (part,), seeds = problem.montecarlo(16).parts, 16
     assert part.model.control
     key = jax.random.fold_in(problem.key, 0)
-    runs = runs_for_means(jm.settled(jm.Isometric()), key, seeds)
+    runs = runs_for_means(jm.Isometric().settled(), key, seeds)
     power = at_once(lambda task: part.model.moments(task).power, as_arrays(jm.Isometric()))
     np.testing.assert_allclose(power, runs.mean_spectrum().power[:30], rtol=1e-9)
 

@@ -17,7 +17,7 @@ import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits._joint import planned_jointly
 from jaxmuscle.model._parameters import DEFAULT_FREE
-from jaxmuscle.objective._arguments import joint_names, task_for
+from jaxmuscle.objective._arguments import joint_names
 from jaxmuscle.objective._consequences import expand, quantities
 from jaxmuscle.objective._covariance import common_scales, identifiability
 from jaxmuscle.objective._options import FitOptions
@@ -42,9 +42,7 @@ def bound(comparisons):
 
 def simulated(task, name, seed, variation=True):
     """A target from seeds of the nonlinear simulator; six Welch segments of each."""
-    runs = jm.ensemble(
-        jm.settled(task), jax.random.key(seed), seeds=SEEDS, dt=2.5e-3, control=False
-    )
+    runs = jm.ensemble(task.settled(), jax.random.key(seed), seeds=SEEDS, dt=2.5e-3, control=False)
     held = np.asarray(runs.between((5.0, 15.0)))
     cv = float(np.sqrt(held.var(axis=1).mean()) / held.mean()) if variation else None
     quantity = "displacement" if task.output_unit == "m" else "force"
@@ -89,7 +87,7 @@ LEVELS = {"low": jm.Isometric().replace(P_w=3.0), "high": jm.Isometric().replace
 def two_levels():
     with without_intervals():
         # as many as its check simulates: one program
-        return jm.fit_joint(levels(), tasks=LEVELS, starts=16, seeds=64)
+        return jm.fit(LEVELS, levels(), starts=16, seeds=64)
 
 
 @pytest.mark.slow
@@ -136,7 +134,7 @@ def test_force_and_displacement_tell_every_stiffness_and_damping():
     }
     tasks = {"force": jm.Isometric(), "displacement": jm.PrescribedForce(F_ext=load)}
     with without_intervals():
-        joint = jm.fit_joint(targets, tasks=tasks, starts=16, seeds=64)
+        joint = jm.fit(tasks, targets, starts=16, seeds=64)
         alone = jm.fit_cohort([targets["force"]], starts=16).results["force"].derived
     assert joint.success, joint.message
     determined = ("K_w0", "K_z0", "C_w0", "C_z0")
@@ -166,7 +164,7 @@ def two_people():
 
 def test_with_all_parameters_separate_it_is_the_single_fits():
     with without_intervals():
-        joint = jm.fit_joint(two_people(), separate=DEFAULT_FREE, starts=16, seeds=0)
+        joint = jm.fit(None, two_people(), separate=DEFAULT_FREE, starts=16, seeds=0)
         alone = jm.fit_cohort(two_people().values(), starts=16).results
     assert joint.success
     assert set(joint.free) == {f"{n}@{t}" for t in two_people() for n in DEFAULT_FREE}
@@ -192,7 +190,7 @@ def test_a_second_equal_target_narrows_errors_by_the_root_of_two():
     )
     with without_intervals():
         alone = jm.fit_cohort([target], starts=8).results["expected"]
-        joint = jm.fit_joint({"a": target, "b": other}, starts=8, seeds=0)
+        joint = jm.fit(None, {"a": target, "b": other}, starts=8, seeds=0)
     assert any(
         "different levels (a 20 % MVC, b 40 % MVC), but their tasks have the same forces" in n
         for n in joint.notices
@@ -246,7 +244,7 @@ def test_names(free, separate, names):
 
 
 def planned(targets, tasks=None, separate=(), proportional=(), **options: Any):
-    tasks = {name: task_for(target) for name, target in targets.items()} if tasks is None else tasks
+    tasks = {name: target.task() for name, target in targets.items()} if tasks is None else tasks
     return planned_jointly(tasks, targets, FitOptions(**options), separate, proportional)
 
 
@@ -325,7 +323,7 @@ def test_proportional_parameters_keep_the_ratio_of_their_tasks(x64):
         "noise_C_z",
         "harmonic_amplitude",
     )
-    tasks = {f"{100 * level:g}": jm.response.at_level(TRUTH, level) for level in (0.15, 0.6)}
+    tasks = {f"{100 * level:g}": TRUTH.at_level(level) for level in (0.15, 0.6)}
     targets = {name: expected(task) for name, task in tasks.items()}
     problem = planned(targets, tasks, proportional=names).problem
     assert problem.coordinates.names == DEFAULT_FREE
@@ -388,9 +386,7 @@ def quick():
     tasks = {"low": TRUTH.replace(P_w=4.0), "high": TRUTH.replace(P_w=8.0)}
     targets = {name: expected(task, name, mvc_fraction=0.2) for name, task in tasks.items()}
     free = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency", "k_w@high")
-    return jm.fit_joint(
-        targets, tasks=tasks, free=free, separate=("harmonic_amplitude",), starts=2, seeds=0
-    )
+    return jm.fit(tasks, targets, free=free, separate=("harmonic_amplitude",), starts=2, seeds=0)
 
 
 def test_a_result_holds_everything(quick):
@@ -483,7 +479,7 @@ def test_a_fit_that_fails_is_a_result(tmp_path):
         "noise_C_w": 0.1
     }
     targets = {"a": expected(ISOMETRIC), "b": expected(ISOMETRIC.replace(P_w=9.0))}
-    joint = jm.fit_joint(targets, fix=still, free=("k_w",), starts=2)
+    joint = jm.fit(None, targets, fix=still, free=("k_w",), starts=2)
     assert (
         not joint.success and "none of the starts gives a spectrum of every target" in joint.message
     )
@@ -503,10 +499,10 @@ SHIFT = jm.Target("shift", 1 / np.arange(1.0, 31.0), segments=12, quantity="disp
 @pytest.mark.parametrize(
     ("targets", "options", "message"),
     [
-        ({}, {}, "targets: none given: name at least one"),
+        ({}, {}, "target: none given: name at least one"),
         ({"a": A, "b@c": B}, {}, "a name must not be empty nor contain '@', as 'b@c' does"),
         ({"a": A, "b": "vastus-lateralis-27mvc"}, {}, "vastus-lateralis-26mvc"),
-        ({"a": A, "b": B}, {"tasks": {"c": ISOMETRIC}}, "tasks: no target is called 'c'"),
+        ({"a": A, "b": B}, {"task": {"c": ISOMETRIC}}, "task: no target is called 'c'"),
         (
             {"a": A, "b": B},
             {"mean_force": {"c": (1.0, 0.1)}},
@@ -543,7 +539,7 @@ SHIFT = jm.Target("shift", 1 / np.arange(1.0, 31.0), segments=12, quantity="disp
         ),
         (
             {"a": A, "b": B},
-            {"tasks": {"b": ISOMETRIC.replace(k_w=4e5)}},
+            {"task": {"b": ISOMETRIC.replace(k_w=4e5)}},
             (
                 "k_w is 500000 in task 'a' and 400000 in 'b', yet they share it: make them equal,"
                 " or list it in separate"
@@ -556,7 +552,7 @@ SHIFT = jm.Target("shift", 1 / np.arange(1.0, 31.0), segments=12, quantity="disp
         ),
         (
             {"a": A, "b": B},
-            {"tasks": {"b": jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise())}},
+            {"task": {"b": jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise())}},
             (
                 "the noise of task 'a' and that of 'b' are BandLimitedNoise and"
                 " OrnsteinUhlenbeckNoise, so noise_K_w cannot be"
@@ -564,7 +560,7 @@ SHIFT = jm.Target("shift", 1 / np.arange(1.0, 31.0), segments=12, quantity="disp
         ),
         (
             {"a": A, "b": SHIFT},
-            {"tasks": {"b": ISOMETRIC}},
+            {"task": {"b": ISOMETRIC}},
             "target 'b' is a displacement, but its task Isometric gives F_ext in N",
         ),
         (
@@ -582,7 +578,24 @@ SHIFT = jm.Target("shift", 1 / np.arange(1.0, 31.0), segments=12, quantity="disp
 )
 def test_bad_arguments(targets, options, message):
     with pytest.raises(ValueError, match=message):
-        jm.fit_joint(targets, **options)
+        jm.fit(options.pop("task", None), targets, **options)
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        (ISOMETRIC, "task: one Isometric, but several targets.*fit_cohort"),
+        ([ISOMETRIC] * 2, "task: one list, but several"),
+    ],
+)
+def test_one_task_for_several_targets(task, message):
+    with pytest.raises(ValueError, match=message):
+        jm.fit(task, {"a": A, "b": B})
+    with pytest.raises(ValueError, match="task: this is of type dict; give a task first"):
+        jm.fit({"a": ISOMETRIC}, A)
+    for targets, option in ((A, "separate"), ({"a": A}, "method")):
+        with pytest.raises(TypeError, match=f"has no option '{option}'"):
+            jm.fit(ISOMETRIC, targets, **{option: ()})
 
 
 def test_priors_and_bounds_by_joint_or_plain_name(x64):
@@ -617,7 +630,7 @@ def test_two_targets_climb_together_and_their_aic_is_that_of_both(x64):
         for name in ("first", "second")
     }
     with without_intervals():
-        found = jm.fit_joint(pair, rungs=2, starts=8, seeds=0, check_seeds=0)
+        found = jm.fit(None, pair, rungs=2, starts=8, seeds=0, check_seeds=0)
     numbers = [rung.number for rung in found.ladder]
     assert numbers == [2] and found.adequate  # a tremor is seen
     (rung,) = found.ladder
@@ -628,20 +641,20 @@ def test_two_targets_climb_together_and_their_aic_is_that_of_both(x64):
     assert abs(found["resonance_frequency"].value - float(truth["resonance_frequency"])) < 1.0
     assert "the spectrum shows a tremor" in " ".join(found.details().split())
     with pytest.raises(ValueError, match="rungs = 2: give at most 3, and no tasks"):
-        jm.fit_joint(pair, rungs=2, tasks={name: jm.Isometric() for name in pair})
+        jm.fit({name: jm.Isometric() for name in pair}, pair, rungs=2)
 
 
 def test_tasks_of_another_mean_force_are_noticed():
     """With tasks the mean is no datum: their newtons are those of another muscle."""
     stated = expected(TRUTH, mean=[60.0, 61.0], unit="N", segments=[12, 12])
     pair = {"a": stated, "b": stated}
-    found = jm.fit_joint(
+    found = jm.fit(
+        dict.fromkeys(pair, TRUTH),
         pair,
-        tasks=dict.fromkeys(pair, TRUTH),
         starts=4,
         seeds=0,
         check_seeds=0,
         free=("c_w", "noise_K_w"),
     )
-    said = [notice for notice in found.notices if "scale the tasks (jaxmuscle.at_force)" in notice]
+    said = [notice for notice in found.notices if "scale them (task.at_force)" in notice]
     assert len(said) == 2 and "the recording with 60.5 N" in said[0]

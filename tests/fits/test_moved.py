@@ -58,7 +58,7 @@ def test_a_response_alone_knows_no_noise_that_would_limit_a_further_measurement(
     assert "no further measurement is tried: the fit has no spectrum" in " ".join(
         str(report).split()
     )
-    with pytest.raises(ValueError, match=r"result: no further measurement is tried.*fit_joint"):
+    with pytest.raises(ValueError, match=r"result: no further measurement is tried.*fit of sev"):
         jm.uncertainty.design_input(result)
 
 
@@ -351,18 +351,18 @@ def written_records(tmp_path):
 def test_one_model_of_the_ladder_is_fitted_with_a_hold(tmp_path, monkeypatch):
     files, seen = written_records(tmp_path), {}
 
-    def fake(targets, **options):
-        seen.update(options)
+    def fake(tasks, targets, **options):
+        seen.update(options, tasks=tasks)
         raise ValueError("enough")
 
-    monkeypatch.setattr(jm, "fit_joint", fake)
+    monkeypatch.setattr(jm, "fit", fake)
     named = ["--force-column", "force_N", "--displacement", "x_m", "--out", str(tmp_path / "out")]
     given = ["fit", files["PULL"], "--hold", files["HOLD"], *named]
     for rung, rungs in (([], 3), (["--rung", "2"], 0), (["--rungs", "1"], 1)):
         seen.clear()
         assert "enough" in CliRunner().invoke(app, [*given, *rung]).stderr
         assert seen["rungs"] == rungs
-        assert seen.get("tasks") == (
+        assert seen["tasks"] == (
             {
                 "moved": jm.model.on_rung(jm.PrescribedLength(), 2),
                 "held": jm.model.on_rung(jm.Isometric(), 2),

@@ -12,7 +12,7 @@ import jaxmuscle as jm
 from jaxmuscle.objective._coordinates import Coordinates
 
 TARGET = jm.load_target("vastus-lateralis-26mvc")
-TASK = jm.task_for(TARGET)
+TASK = TARGET.task()
 BOUNDS = {"harmonic_frequency": (3.0, 9.0)}
 ALONE = {"rungs": 0, "seeds": 0, "check_seeds": 0, "starts": 16}
 

@@ -347,7 +347,7 @@ def test_a_task_that_cannot_be_moved(minute):
         ValueError, match=r"dynamic stiffness, which PrescribedForce cannot give.*PrescribedLength"
     ):
         jm.fit(jm.PrescribedForce(), target)
-    assert isinstance(jm.task_for(target), jm.PrescribedLength)
+    assert isinstance(target.task(), jm.PrescribedLength)
 
 
 def test_a_displacement_that_moved_nothing(minute, tmp_path):
@@ -430,9 +430,7 @@ def test_a_published_response_with_a_spectrum_of_the_same_muscle(published):
     moved = still.as_task(jm.PrescribedLength, P_w=still.P_w)
     tasks = {"moved": moved, "held": still}
     with without_intervals():
-        result = jm.fit_joint(
-            {"moved": published, "held": spectrum}, tasks=tasks, starts=8, seeds=0
-        )
+        result = jm.fit(tasks, {"moved": published, "held": spectrum}, starts=8, seeds=0)
         alone = jm.fit(moved, published, starts=8, check_seeds=0)
     assert result.success and result.adequate
     for name in ("K_w0", "K_z0", "C_w0"):
@@ -520,7 +518,7 @@ def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
         axis=1
     )
     length *= 1e-3 / np.std(length)
-    moved = jm.settled(muscle).with_parts(x_z=jm.model.Sampled.through(time, -length))
+    moved = muscle.settled().with_parts(x_z=jm.model.Sampled.through(time, -length))
     force = np.asarray(jm.simulate(moved, 11, duration=90.0, rate=float(rate)).output)
     record = jm.data.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0))
     with without_intervals():
@@ -530,7 +528,7 @@ def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
         again = seen_with(fit.task, (record,))
     assert alike(fit.target, again)
     with jax.enable_x64(True):
-        resting = float(jm.response.expected_variation(jm.settled(muscle)))
+        resting = float(jm.response.expected_variation(muscle.settled()))
     # Of 60 s a coefficient of variation has an error of 4 %; the base model's muscle left 70 %
     # more.
     assert abs(float(np.mean(fit.target.coefficient_of_variation)) / resting - 1) < 0.1
@@ -589,7 +587,7 @@ def test_a_hold_beside_it_is_of_the_same_masses(minute, result):
     force = muscle_force(np.zeros(SECONDS * RATE), np.random.default_rng(8))
     hold = jm.Recording(force, RATE, unit="N", name="held").steady((2.0, 62.0)).target()
     with without_intervals():
-        both = jm.fit_joint({"moved": minute, "held": hold}, starts=8, seeds=0)
+        both = jm.fit(None, {"moved": minute, "held": hold}, starts=8, seeds=0)
     assert both.success and both.adequate
     assert (
         both["m_w"].free

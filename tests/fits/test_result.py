@@ -464,7 +464,7 @@ def test_every_task_survives_saving(kind, noise, envelope, tmp_path):
             kind(**parts)
         parts["noise"] = eqx.tree_at(lambda n: n.amplitude, NOISES[noise], np.zeros(4))
     task = kind(**parts)
-    jm.save_preset(tmp_path / "task.toml", task, description='with "quotes" and σ')
+    task.save(tmp_path / "task.toml", description='with "quotes" and σ')
     assert_equal(jm.load_preset(tmp_path / "task.toml"), task)
 
 
@@ -475,13 +475,13 @@ def test_laws_initial_state_and_inputs_survive_saving(tmp_path):
         initial=(1 / 3, 0.0, 0.0, -0.1),
         muscle=jm.Muscle(argument="elongation"),
     )
-    jm.save_preset(tmp_path / "task.toml", task)
+    task.save(tmp_path / "task.toml")
     assert_equal(jm.load_preset(tmp_path / "task.toml"), task)
 
 
 def test_arrays_of_jax_are_saved_as_numbers(tmp_path, x64):
     task = jm.Isometric().replace(k_w=jnp.asarray(1e6 / 3), noise_K_w=jnp.asarray(0.2))
-    jm.save_preset(tmp_path / "task.toml", task)
+    task.save(tmp_path / "task.toml")
     loaded = jm.load_preset(tmp_path / "task.toml")
     assert type(loaded["k_w"]) is float and loaded["k_w"] == 1e6 / 3
     assert isinstance(loaded.noise.amplitude, np.ndarray) and loaded["noise_K_w"] == 0.2
@@ -490,9 +490,7 @@ def test_arrays_of_jax_are_saved_as_numbers(tmp_path, x64):
 def test_a_preset_holds_description_and_fit(tmp_path):
     import tomllib
 
-    jm.save_preset(
-        tmp_path / "a.toml", jm.Isometric(), description="what", fit={"target": "t", "seed": 1}
-    )
+    jm.Isometric().save(tmp_path / "a.toml", description="what", fit={"target": "t", "seed": 1})
     table = tomllib.loads((tmp_path / "a.toml").read_text())
     assert table["description"] == "what" and table["fit"] == {"target": "t", "seed": 1}
 
@@ -520,7 +518,7 @@ class OwnTask(jm.PrescribedForce):
 
 def test_a_law_of_the_user_is_saved_by_its_name(tmp_path):
     own_law = eqx.tree_at(lambda t: t.muscle.stiffness_w, jm.Isometric(), Own())
-    jm.save_preset(tmp_path / "a.toml", own_law)
+    own_law.save(tmp_path / "a.toml")
     assert jm.load_preset(tmp_path / "a.toml") == own_law
 
 
@@ -534,7 +532,7 @@ def test_what_could_not_be_read_again_is_not_saved(tmp_path):
         ):
             task_to_table(task)
     with pytest.raises(PresetError):
-        jm.save_preset(path, same_name)
+        same_name.save(path)
     assert not path.exists()
 
 

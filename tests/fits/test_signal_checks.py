@@ -16,7 +16,7 @@ RATE, LEAD = 100.0, 10.0
 
 @pytest.fixture(scope="module")
 def task():
-    return jm.settled(jm.Isometric(harmonic_amplitude=0.0))
+    return jm.Isometric(harmonic_amplitude=0.0).settled()
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_a_fit_says_it_and_measures_with_wider_errors(records):
     time = np.arange(records.shape[1]) / RATE
     given = jm.Recording(about(records[0], 1 + 0.5 * np.sin(2 * np.pi * time / 8)), RATE)
     target = given.target()
-    task = jm.task_for(target)
+    task = target.task()
     quick = {"check_seeds": 0, "seeds": 0, "rungs": 0, "starts": 8}
     result = jm.fit(task, target, **quick)
     bare = jm.fit(task, jm.Target.from_table(target.to_table()), **quick)

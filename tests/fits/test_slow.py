@@ -23,7 +23,7 @@ TRUTH = TRUTH.replace(k_w=1e5, c_w=150.0)
 @pytest.fixture(scope="module")
 def recording():
     """A minute at rest, after 6 s."""
-    run = jm.simulate(jm.settled(TRUTH), jax.random.key(6), duration=66.0)
+    run = jm.simulate(TRUTH.settled(), jax.random.key(6), duration=66.0)
     return jm.Recording(run.output, run.rate, name="minute", window=(6.0, 66.0))
 
 

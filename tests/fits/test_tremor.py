@@ -19,14 +19,14 @@ TRUTH = jm.model.on_rung(jm.PrescribedForce(observe="acceleration"), 2).replace(
 def target() -> jm.Target:
     """Of a minute of the nonlinear model, in g and with gravity, as a sensor on the finger has
     it."""
-    run = jm.simulate(jm.settled(TRUTH), jax.random.key(1), duration=65.0)
+    run = jm.simulate(TRUTH.settled(), jax.random.key(1), duration=65.0)
     samples = np.asarray(run.output, dtype=float)[500:] / 9.81 + 0.7
     return jm.Recording(samples, 100.0, unit="g", name="finger").steady().target()
 
 
 @functools.cache
 def result() -> jm.fits.FitResult:
-    task = jm.model.on_rung(jm.task_for(target()), 2)
+    task = jm.model.on_rung(target().task(), 2)
     return jm.fit(task, target(), starts=16, seeds=16, check_seeds=16)  # as many each: one program
 
 
@@ -61,7 +61,7 @@ def test_an_acceleration_and_a_displacement_that_look_alike_are_no_batch(x64):
         jm.Target(what, power, quantity=what, segments=45)
         for what in ("acceleration", "displacement")
     ]
-    plans = [planned(jm.task_for(target), target, FitOptions()) for target in same]
+    plans = [planned(target.task(), target, FitOptions()) for target in same]
     assert _alike(plans[0]) != _alike(plans[1])
     assert [plan.problem.parts[0].task.quantity for plan in plans] == [
         "acceleration",

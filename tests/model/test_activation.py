@@ -197,12 +197,12 @@ SAVED = {
 
 @pytest.mark.parametrize("name", SAVED)
 def test_a_saved_task_is_read_again(tmp_path, name):
-    jm.save_preset(tmp_path / "task.toml", SAVED[name])
+    SAVED[name].save(tmp_path / "task.toml")
     assert eqx.tree_equal(jm.load_preset(tmp_path / "task.toml"), SAVED[name])
 
 
 def test_a_preset_with_an_impossible_part_is_refused(tmp_path):
-    jm.save_preset(tmp_path / "task.toml", SAVED["all"])
+    SAVED["all"].save(tmp_path / "task.toml")
     text = (tmp_path / "task.toml").read_text()
     for before, after, message in (
         ("time = 0.06", "time = -1.0", "must be positive"),

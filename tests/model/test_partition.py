@@ -120,7 +120,7 @@ def test_all_numbers_of_a_task_are_inexact_arrays(task, tmp_path):
     assert "float64" not in repr((task, task.muscle, task.noise, task.parameters))
     assert jax.tree.structure(jax.grad(lambda t: t["m_w"])(task)) == jax.tree.structure(task)
     if not isinstance(task.muscle, Own):
-        jm.save_preset(tmp_path / "task.toml", task)
+        task.save(tmp_path / "task.toml")
         assert jm.load_preset(tmp_path / "task.toml") == task
 
 
@@ -171,7 +171,7 @@ def test_a_rebuilt_task_is_simulated_and_saved(x64, tmp_path):
     again = rebuild(values)
     runs = [jm.simulate(task, jax.random.key(0), duration=1.0).output for task in (TASK, again)]
     np.testing.assert_allclose(runs[1], runs[0], rtol=1e-12)
-    jm.save_preset(tmp_path / "again.toml", again)
+    again.save(tmp_path / "again.toml")
     assert jm.load_preset(tmp_path / "again.toml").parameters == TASK.parameters
 
 

@@ -209,7 +209,7 @@ def test_simulations_have_the_expected_spectrum(x64):
     """Stiffness noise of 1 %: nonlinearity adds 1e-4 of a bin, a seed scatters by more than half of
     one."""
     # forgets its start by 1 s
-    task, window = jm.settled(jm.Isometric(5.0, 0.003, noise=jm.PinkNoise(0.01))), (1.0, 6.12)
+    task, window = jm.Isometric(5.0, 0.003, noise=jm.PinkNoise(0.01)).settled(), (1.0, 6.12)
     runs = jm.ensemble(
         task, KEY, seeds=256, duration=window[1], dt=1.25e-3, substeps=1, control=False
     )
@@ -334,7 +334,7 @@ def test_impossible_bands_amplitudes_and_grids_are_refused():
 @pytest.mark.parametrize("relative, shared", [(True, False), (False, True)])
 def test_preset_round_trip(tmp_path, relative, shared):
     noise = jm.PinkNoise((0.1, 0.2, 0.0, 0.3), 0.2, 20.0, relative=relative, shared=shared)
-    jm.save_preset(tmp_path / "pink.toml", jm.Isometric(noise=noise))
+    jm.Isometric(noise=noise).save(tmp_path / "pink.toml")
     loaded = jm.load_preset(tmp_path / "pink.toml").noise
     assert isinstance(loaded, jm.PinkNoise)
     assert (loaded.f_low, loaded.f_high, loaded.relative, loaded.shared) == (
@@ -355,7 +355,7 @@ def test_preset_round_trip(tmp_path, relative, shared):
 def test_a_measured_spectrum_is_fitted(tmp_path):
     target = jm.load_target("vastus-lateralis-26mvc")
     with without_intervals():
-        result = jm.fit(jm.task_for(target, noise="pink"), target, starts=8, seeds=0, check_seeds=0)
+        result = jm.fit(target.task(noise="pink"), target, starts=8, seeds=0, check_seeds=0)
     assert result.success, result.message
     # Residuals in standard deviations of the target: a χ² of as many bins, which few free numbers
     # only lower.

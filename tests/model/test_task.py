@@ -115,7 +115,7 @@ def test_the_acceleration_is_equation_1b(x64):
 
 def test_what_is_observed_is_saved(tmp_path):
     task = jm.PrescribedForce(5.0, 1.0, observe="acceleration")
-    jm.save_preset(tmp_path / "task.toml", task)
+    task.save(tmp_path / "task.toml")
     assert jm.load_preset(tmp_path / "task.toml") == task
     text = (tmp_path / "task.toml").read_text()
     # which had no such key
@@ -139,7 +139,7 @@ def test_what_is_observed_is_saved(tmp_path):
 )
 def test_a_moved_insertion_is_saved(tmp_path, moved):
     task = jm.PrescribedLength(x_z=moved, P_w=8.0).replace(m_z=0.62)
-    jm.save_preset(tmp_path / "task.toml", task)
+    task.save(tmp_path / "task.toml")
     loaded = jm.load_preset(tmp_path / "task.toml")
     assert eqx.tree_equal(loaded, task) and isinstance(loaded, jm.PrescribedLength)
     times = np.linspace(0.0, 15.0, 7)

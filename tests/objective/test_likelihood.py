@@ -105,7 +105,7 @@ def test_without_correlation_the_density_of_proportional_powers_is_a_closed_form
     """∫ Π gamma(T p; a, E/a) T^(n-1) dT = Γ(Σa) Π a^a p^(a-1) / (Γ(a) E^a) / (Σ a p / E)^Σa."""
     target = jm.load_target("vastus-lateralis-26mvc")
     bins = independent(measured_bins(target))
-    E = np.asarray(jm.expected_spectrum(jm.task_for(target)).power)
+    E = np.asarray(jm.expected_spectrum(target.task()).power)
     a, p = np.asarray(bins.half), np.exp(bins.log_power)
     expected = np.sum(a * np.log(a) - gammaln(a) + (a - 1) * np.log(p) - a * np.log(E))
     expected += gammaln(a.sum()) - a.sum() * np.log(np.sum(a * p / E))
@@ -125,7 +125,7 @@ def test_slopes_by_hand_are_those_of_differences():
     left out."""
     target = jm.load_target("vastus-lateralis-26mvc")
     bins = measured_bins(target, mask=np.arange(30) % 7 > 0)
-    noise = np.asarray(jm.expected_spectrum(jm.task_for(target)).power)
+    noise = np.asarray(jm.expected_spectrum(target.task()).power)
     line = noise * np.geomspace(1e-3, 1e2, 30)
     line[3] = 1e5 * noise[3]
 
@@ -222,7 +222,7 @@ def bins_information(bins):
 def recording():
     seconds = 60.0
     runs = jm.ensemble(
-        jm.settled(jm.Isometric()), jax.random.key(3), seeds=1, duration=5 + seconds, control=False
+        jm.Isometric().settled(), jax.random.key(3), seeds=1, duration=5 + seconds, control=False
     )
     return jm.Recording(np.asarray(runs.output[0]), 100, window=(5, 5 + seconds))
 
@@ -230,7 +230,7 @@ def recording():
 def test_a_coefficient_of_variation_adds_its_gaussian_density():
     target = jm.load_target("vastus-lateralis-26mvc")
     bare = jm.Target("the spectrum", target.proportional_power, segments=target.segments)
-    task = jm.settled(jm.Isometric(settings=bare.settings))
+    task = jm.Isometric(settings=bare.settings).settled()
     moments = expected_moments(as_arrays(task), bare.settings, WINDOW, trial_samples(bare))[0]
     for measured in (0.01, 0.03):
         data = jm.Target(
@@ -276,7 +276,7 @@ def test_whittle_is_the_law_of_a_periodogram():
     assert float(jm.objective.log_likelihood(task, data)) == pytest.approx(density.sum(), rel=1e-9)
     quiet = task.replace(harmonic_amplitude=0.0)
     expected = np.asarray(
-        jm.expected_spectrum(jm.settled(quiet), spectrum.settings, (0.0, 60.0)).power
+        jm.expected_spectrum(quiet.settled(), spectrum.settings, (0.0, 60.0)).power
     )
     plain = -np.sum(np.log(expected) + np.asarray(spectrum.power) / expected)
     assert float(jm.objective.log_likelihood(quiet, data)) == pytest.approx(plain, rel=1e-9)

@@ -12,7 +12,7 @@ import pytest
 import jaxmuscle as jm
 
 BUNDLED = jm.load_target("vastus-lateralis-26mvc")
-TASK = jm.task_for(BUNDLED)
+TASK = BUNDLED.task()
 # of the trials' coefficients of variation: for the first person the expected scatter is larger, for
 # the second that of the trials
 VARIATIONS = ((0.0101, 0.0102), (0.005, 0.03), (0.01, 0.012))

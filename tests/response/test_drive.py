@@ -115,7 +115,7 @@ ENVELOPES = {
 def test_the_harmonic_through_the_activation_is_that_of_a_noise_free_simulation(x64, name):
     kind, inputs, harmonic = ENVELOPES[name]
     task = references.quiet(kind(*inputs, harmonic=harmonic, activation=TWITCH))
-    power = np.asarray(jm.simulate(jm.settled(task), KEY, dt=5e-4, substeps=1).spectrum().power)
+    power = np.asarray(jm.simulate(task.settled(), KEY, dt=5e-4, substeps=1).spectrum().power)
     # As without activation: Heun's (|λ| dt)² / 6, the envelope joined by lines; here the sine, too,
     # (ω dt)² / 6 = 3e-5.
     expected = linear_spectrum(task, task.settings).power

@@ -461,7 +461,7 @@ PUBLIC = {
 def test_public_functions_run_where_jax_looks_for_nan(call):
     target = jm.load_target("vastus-lateralis-26mvc")
     with jax.debug_nans(True):
-        found = PUBLIC[call](jm.task_for(target), target)
+        found = PUBLIC[call](target.task(), target)
         assert np.all(np.isfinite(np.concatenate([np.ravel(x) for x in jax.tree.leaves(found)])))
         with pytest.raises(jm.errors.OperatingPointError, match="undamped"):
             jm.expected_spectrum(jm.Isometric(c_w=0.0, c_z=0.0))
@@ -470,7 +470,7 @@ def test_public_functions_run_where_jax_looks_for_nan(call):
 def test_fits_and_likelihoods_expect_the_aliases_of_the_recording(x64):
     """Of the rate at which it was taken, to whatever rates it was resampled since."""
     noise = jm.BandLimitedNoise((0.0016, 0.0016, 0, 0))
-    task = jm.settled(jm.PrescribedMotion(F_ext=10, noise=noise)).replace(harmonic_amplitude=0.0)
+    task = jm.PrescribedMotion(F_ext=10, noise=noise).settled().replace(harmonic_amplitude=0.0)
     run = jm.simulate(task, KEY, duration=40.0, rate=500.0)
     target = jm.Recording(np.asarray(run.output).ravel(), 500.0).resampled(250.0).target()
     assert target.recorded_at == 500.0
@@ -615,7 +615,7 @@ def test_line_is_the_spectrum_of_a_noise_free_simulation(x64, name):
     task = references.quiet(
         kind(*INPUTS[kind], harmonic=harmonic, settings=Settings().replace(**changes))
     )
-    power = np.asarray(jm.simulate(jm.settled(task), KEY, dt=5e-4, substeps=1).spectrum().power)
+    power = np.asarray(jm.simulate(task.settled(), KEY, dt=5e-4, substeps=1).spectrum().power)
     # Heun's relative error of a response, (|λ| dt)² / 6 with |λ| <= 120/s; the closed form joins
     # the envelope's samples by lines, Δ² a'' / 8 = 1e-5 of its size.
     expected = linear_spectrum(task, task.settings).power
@@ -734,13 +734,13 @@ def test_transforms_of_long_segments_are_the_matrices(x64, window, detrend):
 
 def test_settled_tasks_rest(x64):
     for kind, inputs in INPUTS.items():
-        held = jm.settled(kind(*inputs))
+        held = kind(*inputs).settled()
         slope = held.vector_field(jnp.zeros(()), held.initial_state(), jnp.zeros(4))
         # [1/s, m/s²]: the root find stops at 1e-12 m, A is 1e3/s² at most
         np.testing.assert_allclose(slope, 0.0, atol=1e-9)
         assert held.parameters == kind(*inputs).parameters
-    start = jax.jit(lambda P: jnp.stack(jm.settled(jm.Isometric(P)).initial))(5.0)
-    np.testing.assert_allclose(start, jm.settled(jm.Isometric(5.0)).initial, rtol=1e-12)
+    start = jax.jit(lambda P: jnp.stack(jm.Isometric(P).settled().initial))(5.0)
+    np.testing.assert_allclose(start, jm.Isometric(5.0).settled().initial, rtol=1e-12)
 
 
 DIFFERENTIATED = {
@@ -956,7 +956,7 @@ SIMULATED = {
 def test_the_expected_coefficient_of_variation_is_that_of_simulations(x64):
     """Its square, whose mean over seeds has a known standard error; and its slope by
     differences."""
-    task, (start, stop) = jm.settled(jm.Isometric(noise="white")), (5.0, 15.0)
+    task, (start, stop) = jm.Isometric(noise="white").settled(), (5.0, 15.0)
     runs = jm.ensemble(task, KEY, seeds=1000, duration=stop, dt=1.25e-3, control=False)
     rate = task.settings.rate
     passed = np.asarray(jm.spectra.lowpass(np.asarray(runs.output), task.settings))[
@@ -980,7 +980,7 @@ def test_the_mean_of_simulations_is_as_expected(x64):
     z, window = [], (1.0, 6.12)
     options = {"seeds": 1000, "duration": window[1], "dt": 1.25e-3, "substeps": 1, "control": False}
     for i, task in enumerate(SIMULATED.values()):
-        runs = jm.ensemble(jm.settled(task), jax.random.fold_in(KEY, i), **options)
+        runs = jm.ensemble(task.settled(), jax.random.fold_in(KEY, i), **options)
         power = np.asarray(runs.spectrum(window=window).power)
         expected = np.asarray(linear_spectrum(runs.task, task.settings, window).power)
         z.append(
@@ -993,7 +993,7 @@ def test_recordings_of_1_khz_are_as_expected_where_they_are_filtered(x64):
     """Decimated by scipy: spectrum and variation are those of "filtered"; of "instant" 5 % too
     large, with its aliases."""
     task, window, seeds = (
-        jm.settled(jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(BOTH))),
+        jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(BOTH)).settled(),
         (5.0, 14.6),
         400,
     )
@@ -1021,7 +1021,7 @@ def test_the_coefficient_of_variation_of_a_recording_scatters_as_expected(x64, a
     """Recordings of 9.6 s by the nonlinear simulator; 400 of them know their standard deviation to
     3.5 %."""
     task = jm.Isometric().replace(harmonic_amplitude=amplitude)
-    runs = jm.ensemble(jm.settled(task), KEY, seeds=400, control=False)
+    runs = jm.ensemble(task.settled(), KEY, seeds=400, control=False)
     held = runs.filtered(window=(5.0, 14.6))
     variation = held.std(axis=1) / held.mean(axis=1)
     moments = expected_moments(as_arrays(task), task.settings, (5.0, 14.6))[0]

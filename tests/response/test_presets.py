@@ -54,7 +54,7 @@ def test_the_task_has_the_mean_force_that_its_file_states(task, mean, unit, newt
 
 def test_single_precision_reaches_it_as_well(tmp_path):
     loaded = jm.load_preset(written(tmp_path, mean=40.5, unit="N"))
-    with_digits = jm.at_force(TASKS["isometric"], 40.5)
+    with_digits = TASKS["isometric"].at_force(40.5)
     assert loaded == with_digits and isinstance(loaded["k_w"], float)
 
 
@@ -81,7 +81,7 @@ def test_a_fit_from_it_has_its_priors_in_ratio(tmp_path, x64):
 
 def test_what_was_carried_is_saved_as_it_is_and_carried_no_second_time(tmp_path):
     loaded = jm.load_preset(written(tmp_path, mean=40.5, unit="N"))
-    jm.save_preset(tmp_path / "again.toml", loaded)
+    loaded.save(tmp_path / "again.toml")
     assert "mean" not in (tmp_path / "again.toml").read_text()
     assert_equal(jm.load_preset(tmp_path / "again.toml"), loaded)
 

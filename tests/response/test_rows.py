@@ -108,7 +108,7 @@ def fit(quantity, length, rungs=(0, 1, 2, 3)):
     power = 1 / (0.3 + f**1.6) + 0.02 * np.exp(-0.5 * ((f - 9) / 0.8) ** 2)
     target = jm.Target("made", power, settings=settings, segments=[12], quantity=quantity)
     for rung in rungs:
-        task = jm.model.on_rung(jm.task_for(target), rung)
+        task = jm.model.on_rung(target.task(), rung)
         jm.fit(task, target, starts=4, seeds=2, check_seeds=0, rungs=0, method="linear")
     found = collections.Counter(names)
     names.clear()

@@ -10,7 +10,7 @@ from compiled import at_once
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.response._expected_moments import expected_moments, linear_spectrum
-from jaxmuscle.response._scaling import at_level, relative_variation, scaled
+from jaxmuscle.response._scaling import relative_variation
 from jaxmuscle.spectra._settings import WINDOW
 
 LEVELS = np.array([5, 10, 20, 25, 30, 35, 40, 60, 80, 90, 95]) / 100  # the range of [30]
@@ -65,7 +65,7 @@ def test_the_steadiest_level_and_the_contrast_are_free():
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_variation_of_the_output_is_smallest_near_30_and_largest_at_95_percent(x64, task):
-    seen = np.array([variation(at_level(task, level, resting=0.1)) for level in LEVELS])
+    seen = np.array([variation(task.at_level(level, resting=0.1)) for level in LEVELS])
     assert LEVELS[seen.argmin()] == pytest.approx(0.3)
     assert LEVELS[seen.argmax()] == pytest.approx(0.95)
     law = [relative_variation(level) for level in LEVELS]
@@ -73,9 +73,7 @@ def test_variation_of_the_output_is_smallest_near_30_and_largest_at_95_percent(x
 
 
 def test_simulated_variation_follows_the_law(x64):
-    steady, weak, strong = (
-        jm.settled(at_level(jm.Isometric(), level)) for level in (0.3, 0.05, 0.95)
-    )
+    steady, weak, strong = (jm.Isometric().at_level(level).settled() for level in (0.3, 0.05, 0.95))
     seen = []
     for task in (steady, weak, strong):
         force = np.asarray(jm.ensemble(task, jax.random.key(4), seeds=64).between(), dtype=float)
@@ -96,11 +94,11 @@ def test_one_and_seven_tenths_percent_at_the_steadiest_level_stay_within_what_pe
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_the_reference_is_the_task_itself_and_steps_add_up(x64, task):
-    assert_same(at_level(task, 0.4, reference=0.4), task)
+    assert_same(task.at_level(0.4, reference=0.4), task)
     law = {"steadiest": 0.33, "resting": 0.2, "damping": 0.7}
-    there = at_level(task, 0.9, reference=0.25, **law)
+    there = task.at_level(0.9, reference=0.25, **law)
     assert_same(
-        at_level(at_level(task, 0.5, reference=0.25, **law), 0.9, reference=0.5, **law),
+        task.at_level(0.5, reference=0.25, **law).at_level(0.9, reference=0.5, **law),
         there,
         rtol=1e-8,
     )
@@ -108,7 +106,7 @@ def test_the_reference_is_the_task_itself_and_steps_add_up(x64, task):
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_without_resting_stiffness_forces_follow_the_level_and_nothing_moves(x64, task):
-    high = at_level(task, 0.9)
+    high = task.at_level(0.9)
     np.testing.assert_allclose(
         jm.response.equilibrium(high), jm.response.equilibrium(task), rtol=1e-9, atol=1e-12
     )
@@ -120,7 +118,7 @@ def test_the_spectrum_keeps_its_maximum_at_every_level(x64):
     """[30]: the maximum of power is at the same frequency at every level, proportional power varies
     slightly."""
     spectra = [
-        np.asarray(jm.expected_spectrum(at_level(jm.Isometric(), level)).proportional)
+        np.asarray(jm.expected_spectrum(jm.Isometric().at_level(level)).proportional)
         for level in LEVELS[1:]
     ]
     assert len({int(p.argmax()) for p in spectra}) == 1
@@ -133,13 +131,13 @@ def test_the_spectrum_keeps_its_maximum_at_every_level(x64):
 def test_damping_keeps_the_corner_or_the_damping_ratio(x64):
     task = jm.Isometric()
     for exponent, kept in ((1.0, 1.0), (0.5, 0.5)):
-        before, after = task.muscle.base(), at_level(task, 0.6, damping=exponent).muscle.base()
+        before, after = task.muscle.base(), task.at_level(0.6, damping=exponent).muscle.base()
         np.testing.assert_allclose(after[2:] / before[2:], (after[:2] / before[:2]) ** kept)
 
 
 def test_every_size_of_an_input_follows_and_its_times_stay():
     task = jm.Isometric(P_w=jm.model.RampHold(4.0, start=1.0, ramp=3.0, initial=2.0))
-    moved = at_level(task, 0.6).P_w
+    moved = task.at_level(0.6).P_w
     assert (moved.level, moved.initial) == (8.0, 4.0)
     assert (moved.start, moved.ramp, moved.corner) == (1.0, 3.0, 0.2)
 
@@ -149,17 +147,17 @@ def test_every_size_of_an_input_follows_and_its_times_stay():
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_variation_falls_with_strength(x64, task):
-    seen = np.array([variation(scaled(task, size)) for size in SIZES])
+    seen = np.array([variation(task.scaled(size)) for size in SIZES])
     assert np.all(np.diff(seen) < 0)
     slope = np.polyfit(np.log(np.square(SIZES)), np.log(seen), 1)[0]
     assert slope == pytest.approx(-0.25, abs=1e-8)
-    assert variation(scaled(task, 2.0, strength_exponent=0.5)) == pytest.approx(variation(task) / 2)
+    assert variation(task.scaled(2.0, strength_exponent=0.5)) == pytest.approx(variation(task) / 2)
 
 
 @pytest.mark.parametrize("exponent", [1.0, 0.0])
 def test_similar_muscles_have_similar_equilibria_and_rates(x64, exponent):
     task = jm.PrescribedForce(F_ext=1.0)
-    large = scaled(task, 2.0, time_exponent=exponent)
+    large = task.scaled(2.0, time_exponent=exponent)
     np.testing.assert_allclose(
         jm.response.equilibrium(large), 2 * jm.response.equilibrium(task), rtol=1e-9, atol=1e-15
     )
@@ -180,7 +178,7 @@ def test_dynamic_similarity_is_exact_far_from_linear(x64):
     small = jm.PrescribedForce(
         P_w=jm.model.SmoothStep(40.0, rise=0.05), F_ext=2.0, initial=(0.002, 0.1, 0.0, -0.1)
     ).replace(**still)
-    large = scaled(small, size)
+    large = small.scaled(size)
     stretched = {
         n: type(s)(s.level, s.start * size, s.rise * size)
         for n, s in (("P_w", large.P_w), ("F_ext", large.F_ext))
@@ -196,8 +194,8 @@ def test_dynamic_similarity_is_exact_far_from_linear(x64):
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_sizes_multiply(x64, task):
-    assert_same(scaled(task, 1.0), task)
-    assert_same(scaled(scaled(task, 1.5), 1.2), scaled(task, 1.8), rtol=1e-8)
+    assert_same(task.scaled(1.0), task)
+    assert_same(task.scaled(1.5).scaled(1.2), task.scaled(1.8), rtol=1e-8)
 
 
 # --- both
@@ -205,7 +203,7 @@ def test_sizes_multiply(x64, task):
 
 def test_derivatives_and_batches_go_through(x64):
     def change(level, size):
-        task = scaled(at_level(jm.Isometric(), level), size)
+        task = jm.Isometric().at_level(level).scaled(size)
         return task["noise_K_w"] * task["k_w"]
 
     slopes = at_once(jax.jacfwd(change, argnums=(0, 1)), jnp.asarray(0.6), jnp.asarray(1.2))
@@ -215,24 +213,24 @@ def test_derivatives_and_batches_go_through(x64):
         up[i], down[i] = up[i] + step, down[i] - step
         assert slope == pytest.approx(float(change(*up) - change(*down)) / (2 * step), rel=1e-5)
     levels = jnp.asarray([0.1, 0.3, 0.9])
-    several = at_once(jax.vmap(lambda level: at_level(jm.Isometric(), level)["noise_K_w"]), levels)
+    several = at_once(jax.vmap(lambda level: jm.Isometric().at_level(level)["noise_K_w"]), levels)
     np.testing.assert_allclose(
         several,
-        [at_level(jm.Isometric(), float(level))["noise_K_w"] for level in levels],
+        [jm.Isometric().at_level(float(level))["noise_K_w"] for level in levels],
         rtol=1e-8,
     )
 
 
 def test_a_task_without_perturbation_stays_without(x64):
     task = jm.Isometric(noise=jm.BandLimitedNoise(0.0)).replace(harmonic_amplitude=0.0)
-    for moved in (at_level(task, 0.9), scaled(task, 2.0)):
+    for moved in (task.at_level(0.9), task.scaled(2.0)):
         assert moved["noise_K_w"] == 0.0 and moved["harmonic_amplitude"] == 0.0
 
 
 def test_single_precision_gives_the_same_numbers():
-    single = at_level(jm.Isometric(), 0.5)
+    single = jm.Isometric().at_level(0.5)
     with jax.enable_x64(True):
-        double = at_level(jm.Isometric(), 0.5)
+        double = jm.Isometric().at_level(0.5)
     assert_same(single, double, rtol=1e-12)
 
 
@@ -244,26 +242,26 @@ class Toe(jm.model.AbstractLaw):
 
 
 BAD = {
-    "percent": (lambda: at_level(jm.Isometric(), 30.0), r"mvc_fraction = 30.0 .* 30 % is 0.3"),
-    "zero": (lambda: at_level(jm.Isometric(), 0.0), "mvc_fraction = 0.0"),
-    "reference": (lambda: at_level(jm.Isometric(), 0.3, reference=1.2), "reference = 1.2"),
-    "steadiest": (lambda: at_level(jm.Isometric(), 0.3, steadiest=0.0), "steadiest = 0.0"),
+    "percent": (lambda: jm.Isometric().at_level(30.0), r"mvc_fraction = 30.0 .* 30 % is 0.3"),
+    "zero": (lambda: jm.Isometric().at_level(0.0), "mvc_fraction = 0.0"),
+    "reference": (lambda: jm.Isometric().at_level(0.3, reference=1.2), "reference = 1.2"),
+    "steadiest": (lambda: jm.Isometric().at_level(0.3, steadiest=0.0), "steadiest = 0.0"),
     "contrast": (lambda: relative_variation(0.3, contrast=-1.0), "contrast = -1.0"),
     "resting": (
-        lambda: at_level(jm.Isometric(), 0.3, resting=1.0),
+        lambda: jm.Isometric().at_level(0.3, resting=1.0),
         r"resting = 1.0 must be in \[0, 1\)",
     ),
     "no force": (
-        lambda: at_level(jm.PrescribedMotion(F_ext=0.0), 0.3),
+        lambda: jm.PrescribedMotion(F_ext=0.0).at_level(0.3),
         "F_ext of this PrescribedMotion = 0.*give F_ext",
     ),
-    "size": (lambda: scaled(jm.Isometric(), 0.0), "size = 0.0 must be positive"),
+    "size": (lambda: jm.Isometric().scaled(0.0), "size = 0.0 must be positive"),
     "law": (
-        lambda: scaled(jm.Isometric(muscle=jm.Muscle(stiffness_z=Toe())), 2.0),
+        lambda: jm.Isometric(muscle=jm.Muscle(stiffness_z=Toe())).scaled(2.0),
         "quadratic laws.*replace",
     ),
     "undamped": (
-        lambda: at_level(jm.Isometric().replace(v_ref_w=0.0, v_ref_z=0.0), 0.5),
+        lambda: jm.Isometric().replace(v_ref_w=0.0, v_ref_z=0.0).at_level(0.5),
         "undamped",
     ),
 }
@@ -352,7 +350,7 @@ def test_a_muscle_carried_to_another_force_has_the_same_spectrum(name, x64):
     the same."""
     before = moments(TASKS[name])
     mean = 40.0 * float(before.mean)
-    after = moments(jm.at_force(TASKS[name], mean))
+    after = moments(TASKS[name].at_force(mean))
     assert float(after.mean) == pytest.approx(mean, rel=EXACT)
     np.testing.assert_allclose(after.proportional, before.proportional, rtol=1e-8)
     np.testing.assert_allclose(after.variation, before.variation, rtol=1e-8)
@@ -360,22 +358,22 @@ def test_a_muscle_carried_to_another_force_has_the_same_spectrum(name, x64):
 
 def test_carrying_back_is_the_task_and_a_displacement_cannot_be_carried(x64):
     task = TASKS["isometric"]
-    there = jm.at_force(task, 100.0)
-    assert_same(jm.at_force(there, float(moments(task).mean)), task)
+    there = task.at_force(100.0)
+    assert_same(there.at_force(float(moments(task).mean)), task)
     with pytest.raises(ValueError, match="the output of PrescribedForce is x_z in m, not a force"):
-        jm.at_force(TASKS["prescribed-force"], 10.0)
+        TASKS["prescribed-force"].at_force(10.0)
     felt = TASKS["prescribed-force"].with_parts(observe="acceleration")
-    for move in (lambda: at_level(felt, 0.5), lambda: scaled(felt, 2.0)):
+    for move in (lambda: felt.at_level(0.5), lambda: felt.scaled(2.0)):
         with pytest.raises(
             ValueError,
             match=r"an acceleration has no coefficient of variation, .* observe='displacement'",
         ):
             move()
     with pytest.raises(ValueError, match=r"of the same sign, not -3\.0 N"):
-        jm.at_force(task, -3.0)
+        task.at_force(-3.0)
     for still in (jm.Isometric(P_w=0.0), jm.PrescribedMotion(F_ext=0.0)):
         with pytest.raises(ValueError, match="mean force of this task is zero"):
-            jm.at_force(still, 3.0)
+            still.at_force(3.0)
 
 
 def test_a_held_force_tells_no_length():

@@ -26,7 +26,7 @@ MOVING = {
 def simulated(task: jm.Isometric, seeds: int = 256) -> np.ndarray:
     """What the nonlinear model has more than the linear response, over that (at least a thousandth
     of its mean)."""
-    runs = jm.ensemble(jm.settled(task), jax.random.key(3), seeds=seeds, chunk=32)
+    runs = jm.ensemble(task.settled(), jax.random.key(3), seeds=seeds, chunk=32)
     first = np.asarray(linear_spectrum(task, task.settings).power)
     return (np.asarray(runs.mean_spectrum().power) - first) / np.maximum(
         first, FAINT * first.mean()
@@ -82,7 +82,7 @@ def test_the_mean_of_a_squared_gaussian(x64):
     """A displacement that the stiffness K(x) = k (x_ref² + x²) answers: the mean shift against a
     simulation's."""
     task = jm.PrescribedForce(F_ext=3.0).replace(harmonic_amplitude=0.1)
-    runs = jm.ensemble(jm.settled(task), jax.random.key(5), seeds=64, chunk=32)
+    runs = jm.ensemble(task.settled(), jax.random.key(5), seeds=64, chunk=32)
     rest = float(np.asarray(runs.output)[0, 0])
     shift = (float(np.mean(np.asarray(runs.output)[:, 500:])) - rest) / abs(rest)
     assert second_order(task).mean == pytest.approx(shift, rel=0.5)
@@ -93,7 +93,7 @@ def test_linear_numbers_come_with_a_warning_where_first_order_ends():
     for number in (
         jm.expected_spectrum,
         jm.response.sensitivity,
-        lambda task: jm.response.at_level(task, 0.5),
+        lambda task: task.at_level(0.5),
     ):
         with pytest.warns(
             FirstOrderWarning,
@@ -146,11 +146,11 @@ def test_an_input_that_moves_in_the_window_is_refused(name):
         lambda: jm.fit(task, target),
         lambda: jm.objective.log_likelihood(task, target),
         lambda: jm.response.sensitivity(task),
-        lambda: jm.response.at_level(task, 0.5),
+        lambda: task.at_level(0.5),
     ):
         with pytest.raises(OperatingPointError, match="P_w of this Isometric moves"):
             number()
-    assert np.all(np.isfinite(np.asarray(jm.expected_spectrum(jm.settled(task)).power)))
+    assert np.all(np.isfinite(np.asarray(jm.expected_spectrum(task.settled()).power)))
 
 
 def test_an_input_that_is_held_in_the_window_is_not():

@@ -43,7 +43,7 @@ def test_plain_monte_carlo_has_the_expected_spectrum(x64):
     task = jm.model.on_rung(base, 2).replace(
         resonance_amplitude=0.05, harmonic_amplitude=base["harmonic_amplitude"]
     )
-    task = jm.settled(task)
+    task = task.settled()
     # Three segments of 400 seeds leave 3 %; the step changes a bin by 0.1 % at most.
     options = {"seeds": 400, "duration": window[1], "dt": 1e-3, "substeps": 1, "control": False}
     runs = jm.ensemble(task, KEY, **options)

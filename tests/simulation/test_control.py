@@ -78,7 +78,7 @@ def test_plain_monte_carlo_of_500_seeds_agrees(x64):
     # a settled task only has to forget that it starts without fluctuations, by 1 s to e^-7
     window, z = (1.0, 6.12), []
     for i, case in enumerate(GRID):
-        task = jm.settled(made(*case))
+        task = made(*case).settled()
         # Three segments of 500 seeds leave 3 %: the step's bias is below 0.2 of it (see the test of
         # the step).
         options = {"duration": window[1], "dt": 1.25e-3, "substeps": 1, "control": False}
@@ -103,7 +103,7 @@ TOGETHER = {"chunk": 32}
 @pytest.mark.parametrize("kind", INPUTS)
 def test_linear_trajectories_have_the_expected_spectrum(x64, kind):
     """`E l` is exact: the mean over 128 seeds, one path each beside the nonlinear task."""
-    runs = jm.ensemble(jm.settled(made(kind, "band-limited", "human")), KEY, seeds=128, **TOGETHER)
+    runs = jm.ensemble(made(kind, "band-limited", "human").settled(), KEY, seeds=128, **TOGETHER)
     power = np.asarray(runs.beside().spectrum().power)
     expected = np.asarray(jm.expected_spectrum(runs.task).power)
     references.assert_standard_normal(deviations(power, expected), every=3)
@@ -126,7 +126,7 @@ AT_PAPER_LEVEL = {
 @pytest.mark.parametrize("name", AT_PAPER_LEVEL)
 def test_at_the_papers_amplitudes_the_response_is_linear(x64, name):
     estimate = jm.ensemble(
-        jm.settled(AT_PAPER_LEVEL[name]), KEY, seeds=32, **TOGETHER
+        AT_PAPER_LEVEL[name].settled(), KEY, seeds=32, **TOGETHER
     ).mean_spectrum()
     # Below 0.2 % of every bin by more than three of its standard errors.
     assert np.all(np.abs(estimate.nonlinearity) + 3 * estimate.stderr / estimate.expected < 2e-3)
@@ -134,7 +134,7 @@ def test_at_the_papers_amplitudes_the_response_is_linear(x64, name):
 
 
 def test_at_human_amplitudes_most_of_the_variance_goes(x64):
-    estimate = jm.ensemble(jm.settled(VASTUS), KEY, seeds=32, **TOGETHER).mean_spectrum()
+    estimate = jm.ensemble(VASTUS.settled(), KEY, seeds=32, **TOGETHER).mean_spectrum()
     assert np.median(estimate.variance_reduction) >= 200
 
 
@@ -276,7 +276,7 @@ def test_slow_beside_fast_motion_is_damped_also_in_single_precision():
     # In single precision the slow rate would be lost in the rounding of the fast one, which is
     # 30,000 times as large.
     c, m, k, ref = 3000.0, 0.5, 5e5, 0.02
-    found = companion(jm.settled(jm.Isometric(5.0, 0.0).replace(c_w=c)), 15.0, required=True)
+    found = companion(jm.Isometric(5.0, 0.0).replace(c_w=c).settled(), 15.0, required=True)
     # P_w = 5 N against k (x_ref² + x²) x and, at x_z = 0, k x_ref² x
     x = np.roots([k, 0.0, 2 * k * ref**2, -5.0])
     stretch = x[np.abs(x.imag) < 1e-12].real[0]
@@ -296,7 +296,7 @@ def test_control_by_default_where_it_pays(x64):
 
 
 def test_a_settled_task_has_no_transient_however_slow(x64):
-    assert jm.ensemble(jm.settled(SLOW), KEY, seeds=32, **TOGETHER).linear is not None
+    assert jm.ensemble(SLOW.settled(), KEY, seeds=32, **TOGETHER).linear is not None
 
 
 def test_without_what_a_controlled_mean_needs(x64):
@@ -336,7 +336,7 @@ def test_under_a_transformation(x64):
 
 def test_single_precision_estimates_the_same():
     def estimate():
-        task = jm.settled(made(jm.Isometric, "band-limited", "paper"))
+        task = made(jm.Isometric, "band-limited", "paper").settled()
         return jm.ensemble(task, KEY, seeds=32, **TOGETHER).mean_spectrum()
 
     single = estimate()

@@ -45,7 +45,7 @@ def test_plain_monte_carlo_agrees_on_every_rung(x64):
     """
     window, z = (1.0, 6.12), []
     for i, (name, rung) in enumerate(RUNGS.items()):
-        task, options = jm.settled(rung), {"duration": window[1], "substeps": 1, "control": False}
+        task, options = rung.settled(), {"duration": window[1], "substeps": 1, "control": False}
         options["dt"] = 5e-4 if name == "motion" else 1.25e-3
         runs = jm.ensemble(task, jax.random.fold_in(KEY, i), seeds=500, **options)
         power = np.asarray(runs.spectrum(window=window).power)
@@ -82,7 +82,7 @@ def halved(path):
 @pytest.mark.parametrize("name", [name for name in RUNGS if name != "activation"])
 def test_half_the_step_gives_the_same_spectrum(x64, name):
     """Of the same 32 paths at 0.5 and 1 ms; the rung "two" has all that "activation" has."""
-    task, steps = jm.settled(RUNGS[name]), 12_240
+    task, steps = RUNGS[name].settled(), 12_240
 
     def spectra(key):
         fine = task.noise.realise(task.noise.draw(key, steps), 5e-4)
@@ -100,7 +100,7 @@ def test_half_the_step_gives_the_same_spectrum(x64, name):
 
 
 def path(noise=jm.BandLimitedNoise(HUMAN), activation=None):  # noqa: B008
-    task = jm.settled(jm.Isometric(5.0, 0.003, noise=noise, activation=activation))
+    task = jm.Isometric(5.0, 0.003, noise=noise, activation=activation).settled()
     return np.asarray(jm.simulate(task, KEY, duration=1.0, dt=1e-4, substeps=1).output)
 
 

@@ -268,7 +268,7 @@ def test_a_seed_is_the_same_whatever_the_batch(task, precision):
 @pytest.mark.parametrize("samples", [131_200, 150_001])
 def test_long_runs_in_single_precision_reach_their_end(samples):
     """A hundred units in the last place of so many steps are more than one step."""
-    run = jm.simulate(jm.settled(jm.Isometric()), KEY, duration=samples / 1000, rate=1000.0)
+    run = jm.simulate(jm.Isometric().settled(), KEY, duration=samples / 1000, rate=1000.0)
     assert run.output.dtype == np.float32 and len(run.output) == samples + 1
     assert np.all(np.isfinite(run.output))
 

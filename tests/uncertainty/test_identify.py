@@ -316,7 +316,7 @@ def test_a_known_mean_is_known_as_well_as_it_was_measured():
 
 def test_a_design_at_other_values_knows_the_factors(x64):
     """Information about θ at the design's own values, as if its task had been fitted."""
-    stronger = jm.response.at_level(TRUTH, 0.5)
+    stronger = TRUTH.at_level(0.5)
     assert float(stronger["k_w"]) > 1.5 * float(TRUTH["k_w"])
     elsewhere = {n: 0.7 * float(TRUTH[n]) for n in DEFAULT_FREE}
     problem, theta = setup_at(fitted(settings={"prior_centre": elsewhere}))
@@ -762,7 +762,7 @@ def test_a_joint_fit_reports_the_promised_errors():
     held, promised = displaced()
     moved = jm.Target("x", spectrum_of(held), segments=SEGMENTS, quantity="displacement")
     targets = {"force": fitted().target, "displacement": moved}
-    joint = jm.fit_joint(targets, tasks={"force": TRUTH, "displacement": held}, starts=4, seeds=0)
+    joint = jm.fit({"force": TRUTH, "displacement": held}, targets, starts=4, seeds=0)
     for name in BASES:
         assert joint.derived[name].stderr == pytest.approx(
             promised.quantities[name].stderr, rel=0.1

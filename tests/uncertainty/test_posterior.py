@@ -131,7 +131,7 @@ def well_known():
     truth = jm.Isometric().replace(
         c_w=80.0, harmonic_frequency=4.0, harmonic_amplitude=0.01, noise_K_z=0.008
     )
-    runs = jm.ensemble(jm.settled(truth), jax.random.key(2), seeds=60, control=False)
+    runs = jm.ensemble(truth.settled(), jax.random.key(2), seeds=60, control=False)
     power = np.asarray(runs.spectrum().proportional).mean(axis=0)
     target = jm.Target("well known", power, segments=(6,) * 60)
     with without_intervals():
@@ -242,7 +242,7 @@ def test_chains_without_a_summary():
 def sloppy():
     target = jm.load_target("vastus-lateralis-26mvc")
     with without_intervals():
-        return jm.fit(jm.task_for(target), target, starts=8, check_seeds=0, rungs=0)
+        return jm.fit(target.task(), target, starts=8, check_seeds=0, rungs=0)
 
 
 @pytest.mark.parametrize(

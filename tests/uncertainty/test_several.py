@@ -48,7 +48,7 @@ def targets():
 @functools.cache
 def both(free=FREE, separate=()):
     with without_intervals():
-        return jm.fit_joint(targets(), tasks=TASKS, free=free, separate=separate, **QUICK)
+        return jm.fit(TASKS, targets(), free=free, separate=separate, **QUICK)
 
 
 @functools.cache
@@ -57,7 +57,7 @@ def alone(name, free=FREE):
 
 
 def test_a_joint_fit_of_one_target_is_the_fit_of_that():
-    joint = jm.fit_joint({"low": targets()["low"]}, tasks={"low": TASKS["low"]}, free=FREE, **QUICK)
+    joint = jm.fit({"low": TASKS["low"]}, {"low": targets()["low"]}, free=FREE, **QUICK)
     for name in (
         "parameters",
         "derived",
@@ -98,11 +98,9 @@ def test_proportional_parameters_are_taken_up_with_their_ratio(x64):
         "noise_C_z",
         "harmonic_amplitude",
     )
-    tasks = {"low": jm.response.at_level(TRUTH, 0.15), "high": jm.response.at_level(TRUTH, 0.6)}
+    tasks = {"low": TRUTH.at_level(0.15), "high": TRUTH.at_level(0.6)}
     with without_intervals():
-        joint = jm.fit_joint(
-            targets(), tasks=tasks, free=("k_w", "c_w"), proportional=names, **QUICK
-        )
+        joint = jm.fit(tasks, targets(), free=("k_w", "c_w"), proportional=names, **QUICK)
     problem = reopened(joint)
     for part, task in zip(problem.parts, tasks.values(), strict=True):
         np.testing.assert_allclose(
@@ -266,7 +264,7 @@ def test_goodness_of_two_targets():
         "high": jm.Target("high", odd, segments=24, coefficient_of_variation=0.02),
     }
     with without_intervals():
-        result = jm.fit_joint(pair, tasks=TASKS, free=FREE, **QUICK)
+        result = jm.fit(TASKS, pair, free=FREE, **QUICK)
     found = jm.checks.goodness(result, replicates=99)
     assert found.parts["high"].p_values["largest"] <= 0.02 < found.parts["low"].p_values["largest"]
     assert found.p_value <= 0.05

@@ -295,7 +295,7 @@ def test_a_muscle_that_cannot_be_is_refused():
 
 def test_a_task_with_an_own_muscle_is_saved_and_read(tmp_path):
     task = jm.Isometric(5.0, muscle=HillMuscle(pennation=0.2))
-    jm.save_preset(tmp_path / "hill.toml", task)
+    task.save(tmp_path / "hill.toml")
     assert jm.load_preset(tmp_path / "hill.toml") == task
     with pytest.raises(ValueError, match="a class of your own must be imported first"):
         text = (tmp_path / "hill.toml").read_text().replace("HillMuscle", "NowhereMuscle")
@@ -514,10 +514,10 @@ def test_the_mean_of_simulations_is_the_linear_response(x64):
         task = hill.held_task(noise=noise)
         key = jax.random.fold_in(KEY, i)
         runs = jm.ensemble(
-            jm.settled(task), key, seeds=320, duration=window[1], dt=1.25e-3, control=False
+            task.settled(), key, seeds=320, duration=window[1], dt=1.25e-3, control=False
         )
         power = np.asarray(runs.spectrum(window=window).power)
-        expected = np.asarray(jm.expected_spectrum(jm.settled(task), window=window).power)
+        expected = np.asarray(jm.expected_spectrum(task.settled(), window=window).power)
         z.append(
             (power.mean(axis=0) - expected) / (power.std(axis=0, ddof=1) / np.sqrt(len(power)))
         )

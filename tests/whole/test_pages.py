@@ -67,7 +67,7 @@ def jitted(*functions: str) -> dict[str, str]:
 # The bundled spectrum with the usual settings (see `write_plain`), and its fit, of which is asked
 # what to measure next.
 PLAIN = 'jm.load_target("plain.toml")'
-PLAIN_FIT = f"jm.fit(jm.task_for({PLAIN}), {PLAIN}, {FEW})"
+PLAIN_FIT = f"jm.fit(({PLAIN}).task(), {PLAIN}, {FEW})"
 IN_PYTHON = {
     "seeds=100_000": "seeds=100",
     "seeds=1000)": "seeds=100)",
@@ -153,7 +153,7 @@ def in_a_folder_of_its_own(tmp_path, monkeypatch):
 @functools.cache
 def recorded(key):
     """A trial as a force sensor writes it: 2048 Hz, rest, ramp, hold of a known task, release."""
-    run = jm.simulate(jm.settled(TRUTH), jax.random.key(key), duration=40.0, rate=1000.0)
+    run = jm.simulate(TRUTH.settled(), jax.random.key(key), duration=40.0, rate=1000.0)
     held = np.interp(np.arange(40 * 2048) / 2048, run.time, np.asarray(run.output, dtype=float))
     level = held.mean()
     force = np.concatenate(
@@ -170,7 +170,7 @@ def write_recordings():
 
 def write_tremor(path):
     """What an accelerometer writes: 1000 Hz, in g, with gravity."""
-    task = jm.settled(jm.PrescribedForce(observe="acceleration"))
+    task = jm.PrescribedForce(observe="acceleration").settled()
     run = jm.simulate(task, jax.random.key(6), duration=30.0, rate=1000.0)
     rows = "".join(
         f"{t:.3f},{a / 9.81 + 0.5:.8f}\n"
@@ -308,7 +308,7 @@ def test_uncertainty(in_python):
 def test_tutorial_and_front_page():
     # The target is the bundled one, written and read again.
     few = {
-        "jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})",
+        "target.task(), target)": f"target.task(), target, {FEW})",
         "fix=known": f"fix=known, {FEW}",
     }
     names = pages.run("docs/tutorial.md", {}, few)
@@ -342,7 +342,7 @@ def test_identifiability():
     # What tests/uncertainty/test_several.py runs on less.
     fewer = {
         'jm.load_target("vastus-lateralis-26mvc")': PLAIN,
-        "jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})",
+        "target.task(), target)": f"target.task(), target, {FEW})",
         "(2.93, 0.06)},": "(2.93, 0.06)}, starts=16, seeds=16, check_seeds=16,",
         'jm.profile(joint, "K_w0")': 'joint["K_w0"]',
         "jm.checks.bootstrap(joint)": "",
@@ -356,14 +356,14 @@ def test_identifiability():
 @pytest.mark.slow
 def test_own_data():
     write_spectrum("mine.csv")
-    once = {"jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})"}
+    once = {"target.task(), target)": f"target.task(), target, {FEW})"}
     assert pages.run("docs/fit-a-csv.md", {}, once)["target"].segments == (6,) * 10
     write_recordings()
     write_tremor("tremor.csv")
     # With a tremor at once: the program of the fit that fits/test_tremor.py makes.
     few = "rungs=0, starts=8, seeds=0, check_seeds=0"
     quick = {
-        "jm.task_for(tremor), tremor": f"jm.model.on_rung(jm.task_for(tremor), 2), tremor, {few}",
+        "tremor.task(), tremor": f"jm.model.on_rung(tremor.task(), 2), tremor, {few}",
         "held.target())\n": f"held.target(), {FEW})\n",
         "fit(jm.Isometric(), target)": f"fit(jm.Isometric(), target, {FEW})",
     }
@@ -446,7 +446,7 @@ def test_machine_learning_with_what_the_tests_do_not_install(package):
     code = next(b for b in pages.blocks(pages.ROOT / LEARNING, "py") if package in b)
     for old, new in (
         ("num_warmup=300, num_samples=300", "num_warmup=10, num_samples=10"),
-        ("jm.task_for(target), target)", f"jm.task_for(target), target, {FEW})"),
+        ("target.task(), target)", f"target.task(), target, {FEW})"),
     ):
         code = code.replace(old, new)
     printed, _ = ended(true_python(head + code, cwd=Path.cwd()))
@@ -567,7 +567,7 @@ def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(in_python
         "seeds=2000": "seeds=100",
         "seeds=100), strict": "seeds=16), strict",
         # Recordings as long as others here.
-        "jm.ensemble(jm.settled(result.task), key, seeds=5, duration=20.0)": "runs",
+        "jm.ensemble(result.task.settled(), key, seeds=5, duration=20.0)": "runs",
         "enumerate(np.asarray(seeds.output))": "enumerate(np.asarray(seeds.output)[:5])",
         "key, duration=60.0, rate=1000.0": "key, duration=40.0, rate=1000.0",
         "window=(2.0, 60.0)": "window=(2.0, 40.0)",
@@ -587,7 +587,7 @@ def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(in_python
         )
         for figure in section.figures:
             code = figure.code.replace(", minute)", f", minute, {few})").replace(
-                "tasks=pair)", f"tasks=pair, {few})"
+                "in pair})", f"in pair}}, {few})"
             )
             # this profile is there
             made = eval(code.replace("band_8_12", "corner_frequency"), names)

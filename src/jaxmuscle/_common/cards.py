@@ -3,7 +3,6 @@
 import abc
 import dataclasses
 import html
-import importlib
 import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -113,15 +112,6 @@ class Result(Shown):
     def summary(self) -> Card:
         """What it prints, as an object; a notebook shows it as a table where there is one."""
         return self._card()
-
-
-def reports() -> Any:
-    """The wing `reports`, which writes what results of fits and studies say.
-
-    It reads results, and so it stands above them. A result that is shown therefore loads it by its
-    name.
-    """
-    return importlib.import_module("jaxmuscle.reports")
 
 
 def facts(heading: str, rows: Sequence[tuple[str, str]], width: int = 8) -> Card:

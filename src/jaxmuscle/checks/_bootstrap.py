@@ -39,7 +39,7 @@ def bootstrap(
     """Whether the standard errors of a fit hold: data are made from the fitted task and fitted
     again.
 
-        result = jm.fit(jm.task_for(target), target)
+        result = jm.fit(target.task(), target)
         print(jm.checks.bootstrap(result))
 
     For every replicate the nonlinear simulator gives one recording for each trial, as long as its

@@ -291,7 +291,7 @@ def goodness(
     """Whether a fit is as good as the scatter of its target allows, by parametric bootstrap with
     refits.
 
-        result = jm.fit(jm.task_for(target), target)
+        result = jm.fit(target.task(), target)
         print(jm.checks.goodness(result))
 
     Three numbers, from the residuals `z_k = (ln(p_k / fitted_k) - bias_k - mean) / sd_k`: chi² per

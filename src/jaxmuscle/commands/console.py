@@ -65,7 +65,7 @@ def aimed(target: Any, task: TaskName | None) -> tuple[Any, Any]:
     """The target, its notices said, and the task to fit to it."""
     for notice in target.notices:
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
-    return target, jm.task_for(target, None if task is None else jm.model.TASKS[task])
+    return target, target.task(None if task is None else jm.model.TASKS[task])
 
 
 @contextlib.contextmanager
@@ -262,9 +262,7 @@ def _field(value: Any) -> str:
 def write_reached(stop: "FitInterrupted", folder: Path) -> None:
     """Where an interrupted fit stood, a preset: to report the fit may take longer than a signal can
     wait."""
-    jm.save_preset(
-        folder / REACHED, stop.tasks[0], description="where a fit stood when it was interrupted"
-    )
+    stop.tasks[0].save(folder / REACHED, description="where a fit stood when it was interrupted")
     stays(f"the best parameters so far are in {folder / REACHED}")
 
 

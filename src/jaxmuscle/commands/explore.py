@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 import jaxmuscle as jm
+from jaxmuscle import explorer
 
 from .console import absent, aim_of, out, plain, record, reporting, spare, task_of
 from .options import Force, Json, Segments, TargetTask, TaskName
@@ -57,7 +58,7 @@ def explore(
         if output is not None:
             spare([what] if what else [], [output])
         model, target = _content(what, task, segments)
-        text = jm.explorer.page(model, target)
+        text = explorer.page(model, target)
         path = _place(output, force=force)
         write_text(path, text)
         record({"page": str(path)})

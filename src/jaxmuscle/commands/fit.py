@@ -289,12 +289,9 @@ def fit(
             given = read_with_holds(target, hold, reading, window)
             beside = [REACHED, *fit_files(output, ("moved", "held"))]
             writable(output, "fit.json", beside=beside, reads=[*target, *hold], force=force)
-            if rung is not None:
-                bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
-                options["tasks"] = {
-                    name: jm.model.on_rung(base, rung) for name, base in bases.items()
-                }
-            converged = _fit_with_holds(*given, output, options, figures, everything=everything)
+            converged = _fit_with_holds(
+                *given, rung, output, options, figures, everything=everything
+            )
         else:
             options |= {
                 "method": str(method),
@@ -435,18 +432,22 @@ def _fit_alone(
 def _fit_with_holds(
     moved: Any,
     held: Any,
+    rung: int | None,
     folder: Path,
     options: dict[str, Any],
     formats: list[str],
     *,
     everything: bool,
 ) -> bool:
-    """Records of a moved and of a held insertion."""
+    """Records of a moved and of a held insertion; on one rung of the ladder if it is given."""
+    both = {"moved": moved, "held": held.target()}
+    bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
+    models = (
+        None if rung is None else {n: jm.model.on_rung(base, rung) for n, base in bases.items()}
+    )
 
     def fitted(tell: Any, answer: Any) -> Any:
-        return jm.fit_joint(
-            {"moved": moved, "held": held.target()}, progress=tell, answer=answer, **options
-        )
+        return jm.fit(models, both, progress=tell, answer=answer, **options)
 
     called = "the moved and the held record"
     return _fit_one(fitted, called, folder, formats, everything=everything)

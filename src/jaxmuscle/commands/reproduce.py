@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-import jaxmuscle as jm
 from jaxmuscle import paper
 
 from .console import out, record, reporting, say_written, writable
@@ -53,7 +52,7 @@ def reproduce(
 
 
 def _reproduce(folder: Path, given) -> None:
-    rows = paper.check(jm.reproduce(folder, given, progress=True))
+    rows = paper.check(paper.reproduce(folder, given, progress=True))
     record({"summary": paper.counted(rows), "claims": [row._asdict() for row in rows]})
     out.print(paper.counted(rows), highlight=False)
     for row in rows:

@@ -51,7 +51,7 @@ def compare_noise(  # noqa: PLR0913 (options of a public call)
     """Fit a spectrum with every colour of noise, with and without harmonic, and say which can be
     told apart.
 
-        print(jm.comparison.compare_noise(jm.task_for(target), target))
+        print(jm.comparison.compare_noise(target.task(), target))
 
     The richer models that a fit may climb to (`on_rung`) are compared, too, with the task's own
     noise: "activation", "resonance" instead of the harmonic, "two resonances".

@@ -109,7 +109,8 @@ def _remedy(given: Any) -> str:
     if isinstance(given, Sequence) and len(given) > 0:
         return (
             "target: a list holds the recordings of one condition, or their paths; spectra of"
-            " several people are fitted by fit_cohort, those of one person by fit_joint"
+            " several people are fitted by fit_cohort, those of one person together as {name:"
+            " target}"
         )
     return f"{what} {usual}"
 

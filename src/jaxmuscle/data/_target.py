@@ -4,7 +4,7 @@ import dataclasses
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import equinox as eqx
 import numpy as np
@@ -16,6 +16,15 @@ from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.units import NEWTONS
+from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._noises import with_noise
+from jaxmuscle.model._tasks import (
+    AbstractTask,
+    Isometric,
+    Observed,
+    PrescribedForce,
+    PrescribedLength,
+)
 from jaxmuscle.spectra._bin_law import bin_statistics, dispersion_of, mean_error, trial_samples
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -242,13 +251,32 @@ class Target(Shown, eqx.Module):
         mean = float(means.mean())
         return mean, float(mean_error(means, max(relative, LEAST_MEAN_ERROR) * mean))
 
+    def task(
+        self, kind: type[AbstractTask] | None = None, *, noise: str | AbstractNoise | None = None
+    ) -> AbstractTask:
+        """The task that was measured: `Isometric` for force and torque, `PrescribedLength` for a
+        dynamic stiffness, `PrescribedForce` for displacement and acceleration (with
+        `observe="acceleration"`).
+
+            task = jm.load_target("vastus-lateralis-26mvc").task(noise="pink")
+
+        Of another `kind` if one is given. It has the target's spectrum settings and default
+        parameters; `noise` is "white", "band-limited", "ornstein-uhlenbeck", "pink", or a noise
+        object.
+        """
+        what: Any = self.quantity
+        held = Isometric() if self.stiffness is None else PrescribedLength()
+        task = PrescribedForce(observe=what) if what in get_args(Observed) else held
+        task = task if kind in (None, type(task)) else kind()
+        return with_noise(task.with_parts(settings=self.settings), noise)
+
     def data(self) -> TargetData:
         """What `log_likelihood` asks of the target, as arrays alone: a pytree for `jax.jit`,
         `jax.grad` and `jax.vmap`.
 
             target = jm.load_target("vastus-lateralis-26mvc")
             height = jax.jit(jm.objective.log_likelihood)
-            height(jm.task_for(target), target.data())
+            height(target.task(), target.data())
 
         A function that is given it as an argument is compiled once for all targets with the same
         settings, number of bins and number of trials. A target itself would be compiled in.

@@ -41,7 +41,9 @@ _SHOWN = ("name", "bins", "frequency", "proportional_power", "sigma", "segments"
 def page(task: AbstractTask | None = None, target: Target | None = None) -> str:
     """The explorer as the text of one HTML file, which needs neither server nor network.
 
-        text = jm.explorer.page(jm.Isometric(k_w=4e5))
+        from jaxmuscle import explorer
+
+        text = explorer.page(jm.Isometric(k_w=4e5))
         Path("explorer.html").write_text(text, encoding="utf-8")
 
     It computes the expected spectrum of a task in JavaScript, as `expected_spectrum` does, while
@@ -125,6 +127,6 @@ def _check(task: AbstractTask) -> None:
         ):
             raise ValueError(
                 f"{name} is a {type(signal).__name__}, which no slider can set: hold it at its"
-                " level, with settled(task)"
+                " level, with task.settled()"
             )
     has_response(task, required=True)

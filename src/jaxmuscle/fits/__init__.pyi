@@ -4,7 +4,6 @@ from ._cohort import CohortResult as CohortResult
 from ._cohort import fit_cohort as fit_cohort
 from ._differences import Difference as Difference
 from ._fit import fit as fit
-from ._joint import fit_joint as fit_joint
 from ._own_problem import Problem as Problem
 from ._own_problem import problem as problem
 from ._part import Estimate as Estimate

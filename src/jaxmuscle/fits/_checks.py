@@ -424,6 +424,6 @@ def notices_of(
         notices.append(
             f"slow muscle: when the analysed part of a simulation begins, {100 * left:.1g} % of the"
             " start-up is still left. The fit assumes a settled muscle. To simulate that in"
-            " Python, use jaxmuscle.settled(task)"
+            " Python, use task.settled()"
         )
     return tuple(notices)

@@ -10,16 +10,17 @@ import equinox as eqx
 import numpy as np
 
 from jaxmuscle import plot
-from jaxmuscle._common.cards import Card, Result, reports
+from jaxmuscle._common.cards import Card, Result
 from jaxmuscle._common.environment import fitting, versions
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.tables import frame
+from jaxmuscle._common.upward import load_above
 from jaxmuscle.data._measure import Measure
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
-from jaxmuscle.objective._arguments import Plan, at_mean, planned, task_for
+from jaxmuscle.objective._arguments import Plan, at_mean, planned
 from jaxmuscle.objective._options import FitOptions, SearchOptions
 from jaxmuscle.spectra._bin_law import trial_samples
 from jaxmuscle.spectra._fluctuations import BANDS
@@ -95,7 +96,7 @@ class CohortResult(Result, eqx.Module):
         )
 
     def _card(self) -> Card:
-        return reports().cohort_card(self)
+        return load_above("reports").cohort_card(self)
 
     def table(self) -> list[dict[str, Any]]:
         """Tidy rows, one per target and quantity (measured ones, free parameters, derived ones),
@@ -290,7 +291,7 @@ def fit_cohort(
     with told(progress, f"fitting {len(loaded)} targets") as tell, fitting():
         batches: dict[Any, dict[str, Plan]] = {}
         for name, target in loaded.items():
-            model = with_noise(task_for(target, task), asked.noise, asked.fix)
+            model = with_noise(target.task(task), asked.noise, asked.fix)
             try:
                 model, given = at_mean(on_rung(model, rung) if rung else model, target, asked)
                 plan = planned(model, target, options_for(model, given))

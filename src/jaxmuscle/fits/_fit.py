@@ -1,8 +1,10 @@
-"""Fit of a task's parameters to a target spectrum, in linear response or by Monte Carlo."""
+"""Fit of a task's parameters to a target spectrum, in linear response or by Monte Carlo; to several
+targets of one person together."""
 
-from collections.abc import Callable
-from typing import Any, Literal, Unpack
+from collections.abc import Callable, Mapping
+from typing import Any, Unpack, overload
 
+from jaxmuscle._common.arguments import check_options
 from jaxmuscle._common.arrays import all_concrete, require
 from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.progress import told
@@ -14,30 +16,46 @@ from jaxmuscle.model._rungs import QUIET, RUNGS, is_base, on_rung
 from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import Plan, at_mean, planned
-from jaxmuscle.objective._options import DT, FitOptions, SimulationOptions
+from jaxmuscle.objective._options import FitOptions, JointFitOptions, OneFitOptions
 
+from ._joint import fit_jointly
 from ._ladder import Models, first_rung, options_for
 from ._perturbed import ANEW, alike, analysed, recordings_of, seen_with, without_rhythm
 from ._result import FitResult
 from ._search import search
 
 
+@overload
 def fit(
     task: AbstractTask,
     target: Any,
     *,
-    method: str = "linear",
-    mean_force: tuple[float, float] | Literal[False] | None = None,
-    dt: float = DT,
+    progress: bool | Callable[[str, float], None] = ...,
+    answer: Callable[[FitResult], None] | None = ...,
+    **options: Unpack[OneFitOptions],
+) -> FitResult: ...
+@overload
+def fit(
+    task: Mapping[str, AbstractTask] | None,
+    target: Mapping[str, Any],
+    *,
+    progress: bool | Callable[[str, float], None] = ...,
+    answer: Callable[[FitResult], None] | None = ...,
+    **options: Unpack[JointFitOptions],
+) -> FitResult: ...
+def fit(
+    task: Any,
+    target: Any,
+    *,
     progress: bool | Callable[[str, float], None] = False,
     answer: Callable[[FitResult], None] | None = None,
-    **options: Unpack[SimulationOptions],
+    **options: Any,
 ) -> FitResult:
     """Find the parameters whose expected spectrum is the target's: Levenberg-Marquardt from many
     starts.
 
         target = jm.load_target("vastus-lateralis-26mvc")
-        result = jm.fit(jm.task_for(target), target)
+        result = jm.fit(target.task(), target)
         print(result)
 
     Minimises `½ Σ r_k² + ½ Σ θ_j²`, r the residuals in standard deviations of the target, `(z_k -
@@ -52,7 +70,7 @@ def fit(
 
     **Arguments:**
 
-    - `task`: the model; its values are the prior's centre. `task_for(target)` makes one
+    - `task`: the model; its values are the prior's centre. `target.task()` makes one
     - `target`: what is fitted; its spectrum settings replace the task's. A `Target`, a `Recording`,
       the recordings of one condition (a list, `Trials`), a `PerturbedRecording` or several, a
       `FrequencyResponse`, or names and paths of these (with a `PrescribedLength` a file of force
@@ -75,8 +93,8 @@ def fit(
     - `coefficient_of_variation`: whether the target's, if it states one, is one more residual (it
       fixes the scale of the noise)
     - `mean_force` (value, sd) [N] as a further residual, of a task that you have scaled
-      (`at_force`) and whose P_w you free. By default, if the target states its mean in newtons,
-      that mean: then the task is scaled to it, and P_w is free. False: no mean is used
+      (`task.at_force`) and whose P_w you free. By default, if the target states its mean in
+      newtons, that mean: then the task is scaled to it, and P_w is free. False: no mean is used
     - `max_steps` of each search from a starting point
     - `check_seeds`: fresh noise paths of the reported spectrum (64; 200 for a task without linear
       response; 0: not simulated)
@@ -87,11 +105,44 @@ def fit(
     - `answer`: a function that gets the result as soon as the search ends: with the verdict, before
       the simulated check, and before profile and p-value of the harmonic
 
-    **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
+    **Several targets of one person**, two force levels, or force and displacement, are fitted
+    together with shared parameters:
+
+        together = jm.fit(None, {"low": low, "high": high}, separate=("noise_K_w",))
+        together["k_w"]
+
+    The residuals of all targets are summed, in linear response, and each target's spectrum has its
+    own nonlinear correction. A parameter of one name is the same number in all tasks that have it;
+    one that only one task has belongs to that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's
+    own. Not for two spectra of one recording ("standard" and "slow"): its data would count twice; a
+    notice says so. Then the arguments are as above, but for these:
+
+    - `task` {name: task}, or None; of a target that is not named its own, `target.task()`
+    - `target` {name: target, in any of the forms} (of one: the fit of that)
+    - `separate`: names of parameters that have a value for each target, then called "c_w@high"
+    - `proportional`: names that keep the ratio which their values have in the tasks (as
+      `task.at_level` sets them)
+    - `free` and `fix`: "P_w@high" for one target's
+    - `starts`: 32. `seeds`: 32. `check_seeds`: 0, the linear response times the correction
+    - `mean_force` {target: (value, sd)} [N]: means as further data, of tasks that you have scaled.
+      By default, if no tasks are given, the means that the targets state in newtons: then all tasks
+      are scaled by one number, to the first of these means, and every target that states a mean has
+      a free P_w. Where one target is of a moved insertion, the masses are not scaled, and are free
+      in all tasks
+    - `rungs`: 0; all targets get the same model. Not with tasks
+    - no `method`, no `dt`
+
+    **Returns:** a `FitResult`, with a part for each target; a fit that fails is one, too, and says
+    why.
 
     **Raises:** `ValueError` for bad arguments (unknown names with the nearest known, too few bins,
-    values outside bounds); `FitInterrupted` on Ctrl-C, with what was reached.
+    values outside bounds, tasks that contradict each other in what they share); `FitInterrupted` on
+    Ctrl-C, with what was reached.
     """
+    if isinstance(target, Mapping):
+        check_options(fit, JointFitOptions, options)
+        return fit_jointly(task, target, progress, answer, **options)
+    check_options(fit, OneFitOptions, options)
     require_task(task, "fit(task, target)")
     require(
         all_concrete(task),
@@ -102,8 +153,7 @@ def fit(
     recordings = recordings_of(target, task)
     aim = recordings[0].name if recordings else (target := as_target(target)).name
     with told(progress, f"fitting {aim}") as tell, fitting():
-        own = {"method": method, "mean_force": mean_force, "dt": dt, "progress": tell}
-        given = FitOptions.of(fit, SimulationOptions, options, **own)
+        given = FitOptions(**options, progress=tell)
         task = with_noise(task, given.noise, given.fix)
         if recordings:
             tell("subtracting the response to the movement", 0.01)

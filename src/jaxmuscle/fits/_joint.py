@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Unpack
+from typing import Any
 
 from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.progress import told
@@ -24,12 +24,11 @@ from jaxmuscle.objective._arguments import (
     planned,
     settings_of,
     target_of,
-    task_for,
 )
 from jaxmuscle.objective._derived import MEAN
-from jaxmuscle.objective._options import FitOptions, SimulationOptions
+from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import FitProblem
-from jaxmuscle.response._scaling import at_force, is_scalable, times_force
+from jaxmuscle.response._scaling import is_scalable, times_force
 
 from ._ladder import Models, first_rung
 from ._perturbed import ANEW, aimed, alike, recordings_of, seen_with
@@ -40,65 +39,28 @@ Tasks = dict[str, AbstractTask]
 FAR = 0.1  # of a stated mean force
 
 
-def fit_joint(
+def fit_jointly(
+    tasks: Mapping[str, AbstractTask] | None,
     targets: Mapping[str, Any],
+    progress: bool | Callable[[str, float], None],
+    answer: Callable[[FitResult], None] | None,
     *,
-    tasks: Mapping[str, AbstractTask] | None = None,
     separate: Iterable[str] = (),
     proportional: Iterable[str] = (),
     mean_force: Mapping[str, tuple[float, float]] | None = None,
-    progress: bool | Callable[[str, float], None] = False,
-    answer: Callable[[FitResult], None] | None = None,
-    **options: Unpack[SimulationOptions],
+    **options: Any,
 ) -> FitResult:
-    """Fit several spectra of the same person with shared parameters: two force levels, or force and
-    displacement.
-
-        together = jm.fit_joint({"low": low, "high": high}, separate=("noise_K_w",))
-        together["k_w"]
-
-    Minimises `½ Σ_targets Σ_k r_k² + ½ Σ_j θ_j²`, r as in `fit`, in linear response, from many
-    starts; then with the nonlinear model's correction to every target's spectrum. A parameter of
-    one name is the same number in all tasks that have it; one that only one task has belongs to
-    that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's own. Not for two spectra of one
-    recording ("standard" and "slow"): its data would count twice; a notice says so.
-
-    **Arguments:**
-
-    - `targets` {name: target, in any form that `fit` takes} (of one: the fit of that)
-    - `tasks` {name: task} (`task_for` of each target by default), whose values are the prior's
-      centre and whose spectrum settings the target's replace
-    - `separate`: names of parameters that have a value for each target, then called "c_w@high"
-    - `proportional`: names that keep the ratio which their values have in the tasks (as `at_level`
-      sets them)
-    - `free`: names to fit, "P_w@high" for one target's (default as in `fit`)
-    - `fix` {name or "name@target": value}
-    - `noise` of all tasks
-    - `starts`: as in `fit` (32)
-    - `seeds` of the nonlinear correction (32; 0: none)
-    - `check_seeds`: fresh seeds of the nonlinear model for each reported spectrum (0: linear
-      response times the correction)
-    - `bounds`, `priors`, `key`, `coefficient_of_variation`, `max_steps`, `progress`: as in `fit`
-    - `mean_force` {target: (value, sd)} [N]: means as further data, of tasks that you have scaled
-      (`at_force`). By default, if no `tasks` are given, the means that the targets state in
-      newtons: then all tasks are scaled by one number, to the first of these means, and every
-      target that states a mean has a free P_w. Where one target is of a moved insertion, the masses
-      are not scaled, and are free in all tasks
-    - `rungs`: how many richer models may be tried where a spectrum shows a tremor, or the base
-      model does not describe the data (`on_rung`; all targets get the same one). Not with `tasks`
-    - `answer`: as in `fit`
-
-    **Returns:** a `FitResult` with a part for each target; a fit that fails is one, too, and says
-    why.
-
-    **Raises:** `ValueError` for no targets, names that no target, task or parameter has, tasks that
-    contradict each other in what they share, and what `fit` refuses.
-    """
-    usual = {"starts": 32, "seeds": 32, "check_seeds": 0}
-    asked = FitOptions.of(fit_joint, SimulationOptions, usual | dict(options))
+    """The fit of several targets, see `fit`."""
+    if tasks is not None and not isinstance(tasks, Mapping):
+        raise ValueError(
+            f"task: one {type(tasks).__name__}, but several targets. Of one person: give {{name:"
+            " task}, or None for the task of each target; of several people: use fit_cohort"
+        )
+    usual: dict[str, Any] = {"starts": 32, "seeds": 32, "check_seeds": 0}
+    asked = FitOptions(**usual | options)
     rungs = asked.rungs or 0
     loaded = _loaded(targets, tasks or {})
-    for argument, named in (("tasks", tasks or {}), ("mean_force", mean_force or {})):
+    for argument, named in (("task", tasks or {}), ("mean_force", mean_force or {})):
         for name in named:
             if name not in loaded:
                 raise ValueError(
@@ -162,8 +124,8 @@ def _far_from_means(result: FitResult) -> tuple[str, ...]:
         if stated is not None and own is not None and abs(own.value - stated[0]) > FAR * stated[0]:
             found.append(
                 f"{name}: the fitted muscle pulls with {own.value:.3g} N, the recording with"
-                f" {stated[0]:.3g} N. With tasks= the mean force is no datum: scale the tasks"
-                f" (jaxmuscle.at_force), and give mean_force={{{name!r}: (mean, sd)}}. All newtons"
+                f" {stated[0]:.3g} N. The mean force is no datum of tasks that are given: scale"
+                f" them (task.at_force), and give mean_force={{{name!r}: (mean, sd)}}. All newtons"
                 " here are those of another muscle"
             )
     return tuple(found)
@@ -178,7 +140,7 @@ def planned_jointly(
     mean_force: Mapping[str, tuple[float, float]] | None = None,
     carried: Iterable[str] = (),
 ) -> Plan:
-    """The fit of several targets, its arguments checked (see `fit_joint`). Needs double precision.
+    """The fit of several targets, its arguments checked (see `fit`). Needs double precision.
 
     `carried`: the targets whose P_w is free, too, since it follows from their mean force.
     """
@@ -238,10 +200,10 @@ def planned_jointly(
 
 def _loaded(targets: Mapping[str, Any], tasks: Mapping[str, AbstractTask]) -> dict[str, Target]:
     if not targets:
-        raise ValueError("targets: none given: name at least one")
+        raise ValueError("target: none given: name at least one")
     for name in targets:
         if not name or "@" in name:
-            raise ValueError(f"targets: a name must not be empty nor contain '@', as {name!r} does")
+            raise ValueError(f"target: a name must not be empty nor contain '@', as {name!r} does")
     return {name: aimed(t, tasks.get(name)).with_measures() for name, t in targets.items()}
 
 
@@ -262,8 +224,8 @@ def _models(
         {t: {base_of(n): v for n, v in fix.items() if target_of(n) in ("", t)} for t in targets},
     )
     for name, target in targets.items():
-        task = tasks[name] if name in tasks else task_for(target)
-        check_quantity(task, target, name, f"give tasks={{{name!r}: ...}}")
+        task = tasks[name] if name in tasks else target.task()
+        check_quantity(task, target, name, f"give it a task: {{{name!r}: ...}}")
         found[name] = with_noise(task.with_parts(settings=target.settings), noise, fixed[name])
     held = {name: _holders("fix", name, found) for name in fix}
     return {
@@ -327,7 +289,7 @@ def _at_means(
     if not stated or not all(is_scalable(task.muscle) for task in tasks.values()):
         return tasks, {}, None
     first, (mean, _) = next(iter(stated.items()))
-    factor = float(at_force(tasks[first], mean)["P_w"]) / float(tasks[first]["P_w"])
+    factor = float(tasks[first].at_force(mean)["P_w"]) / float(tasks[first]["P_w"])
     scaled = {name: times_force(task, factor) for name, task in tasks.items()}
     if _any_moved(targets):  # displacements are known: masses are no scale
         scaled = {

@@ -411,7 +411,7 @@ def of_several(parts: dict[str, FittedPart]) -> tuple[str, ...]:
         *twice,
         (
             f"the targets state different levels ({said}), but their tasks have the same forces:"
-            " give tasks="
+            " give a task for each"
         ),
     )
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import from_nulls, with_nulls
-from jaxmuscle._common.cards import Card, Result, reports
+from jaxmuscle._common.cards import Card, Result
 from jaxmuscle._common.documents import checked, converted, parsed
 from jaxmuscle._common.errors import ResultError
 from jaxmuscle._common.files import expanded, write_json
@@ -21,6 +21,7 @@ from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, probability
+from jaxmuscle._common.upward import load_above
 from jaxmuscle.data._measure import Measure
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
@@ -303,12 +304,12 @@ class FitResult(Result, eqx.Module):
     def details(self) -> str:
         """As text all that it found: also models that were tried, parameters, what the data do not
         determine."""
-        return reports().fit_text(self, everything=True)
+        return load_above("reports").fit_text(self, everything=True)
 
     def methods(self) -> str | None:
         """A paragraph for the methods section of a paper; None for several targets, a moved
         insertion, a failed fit."""
-        return reports().fit_methods(self)
+        return load_above("reports").fit_methods(self)
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The figure of the fit."""
@@ -325,7 +326,7 @@ class FitResult(Result, eqx.Module):
         return per_newton(table, self.derived[MEAN].value) if self.per_newton else dict(table)
 
     def _card(self) -> Card:
-        return reports().fit_card(self)
+        return load_above("reports").fit_card(self)
 
 
 def to_table(result: FitResult) -> dict[str, Any]:

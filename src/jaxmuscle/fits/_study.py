@@ -18,7 +18,7 @@ import numpy as np
 from jaxmuscle import plot
 from jaxmuscle._common.arguments import check_options
 from jaxmuscle._common.arrays import with_nulls
-from jaxmuscle._common.cards import Card, Result, reports
+from jaxmuscle._common.cards import Card, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.figures import remove_figures, write_figure
 from jaxmuscle._common.files import remove, write_json, write_text
@@ -27,6 +27,7 @@ from jaxmuscle._common.progress import Tell, told
 from jaxmuscle._common.tables import csv_of, frame
 from jaxmuscle._common.text import WIDTH, choices
 from jaxmuscle._common.types import Key
+from jaxmuscle._common.upward import load_above
 from jaxmuscle.data._measured import MEASURES
 from jaxmuscle.data._recording_choice import ReadingOptions
 from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_study
@@ -251,7 +252,7 @@ class StudyResult(Result, eqx.Module):
     def methods(self) -> str:
         """A paragraph for the methods section of a paper: people, recordings, spectra, model,
         statistics, versions."""
-        return reports().study_methods(self)
+        return load_above("reports").study_methods(self)
 
     def plot(self, ax: "Axes | None" = None, *, proportional: bool = True) -> "Figure | SubFigure":
         """Spectra of people and means of groups, a panel for each condition; see
@@ -318,7 +319,7 @@ class StudyResult(Result, eqx.Module):
         return _Drawn({cell.target.name: cell for cell in self.cells}, groups, rows)
 
     def _card(self) -> Card:
-        return reports().study_card(self)
+        return load_above("reports").study_card(self)
 
 
 FILES = ("table1.csv", "people.csv", "differences.csv", "study.json", "methods.txt")

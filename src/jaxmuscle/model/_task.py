@@ -4,6 +4,7 @@ itself."""
 import abc
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxmuscle._common.arrays import Inexact, _is_scalar, checked, is_concrete, require
 from jaxmuscle._common.cards import Card, Shown, in_columns
 from jaxmuscle._common.types import Scalar
+from jaxmuscle._common.upward import load_above
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._activation import ACTIVE, Activation
@@ -40,6 +42,7 @@ from ._white_noise import BandLimitedNoise
 
 State = Float[Array, " states"]
 Task = TypeVar("Task", bound="AbstractTask")
+HOLD = 15.0  # s from the start, by when inputs are held: the end of the analysed window
 
 
 # What a field must be, and how one is written.
@@ -190,6 +193,131 @@ class AbstractTask(Shown, Inexact):
         )
         parts[which] = eqx.tree_at(lambda n: n.amplitude, parts[which], wider)
         return self.with_parts(noise=NoiseSum(tuple(parts)) if len(parts) > 1 else parts[0])
+
+    def settled(self: Task, time: float = HOLD) -> Task:
+        """The task with its inputs held at their values at `time` [s] from the start, and starting
+        from equilibrium.
+
+            run = jm.simulate(jm.Isometric().settled(), jax.random.key(0), duration=10.0)
+
+        Its simulation has no rise and no transient of the mean: what the linear response describes.
+        """
+        return load_above("response._linearised").settled(self, time)
+
+    def at_force(self: Task, mean: Scalar) -> Task:
+        """The task scaled to another mean force: forces, masses, stiffness and damping multiplied
+        by one number.
+
+            task = jm.Isometric().at_force(40.5)
+
+            P_w, F_ext, m_j, k_j, c_j ∝ s    (and noise in absolute units)
+            s = mean / (mean force of the task)
+
+        Every term of (1a) and (1b) is then s times what it was: displacements, times, proportional
+        power and the coefficient of variation stay to the last digit, forces are s times as large.
+        So a fit that starts from this task has its priors centred on these values, and a mean force
+        in newtons can be data (`fit(..., mean_force=)`).
+
+        **Arguments:** `mean` [N], of the sign of the task's own mean force.
+
+        **Raises:** `ValueError` for a task whose output is not a force or has a mean of zero, a
+        `mean` of zero or of the other sign, a muscle that is not made of the paper's quadratic
+        laws; `OperatingPointError` (a `ValueError`) where there is no stable equilibrium.
+        """
+        return load_above("response._scaling").at_force(self, mean)
+
+    def at_level(
+        self: Task,
+        mvc_fraction: Scalar,
+        *,
+        reference: Scalar = 0.3,
+        steadiest: Scalar = 0.3,
+        contrast: Scalar = 1.0,
+        resting: Scalar = 0.0,
+        damping: Scalar = 1.0,
+    ) -> Task:
+        """The task at another level of contraction, `mvc_fraction` L; as it is, it stands for
+        `reference` L₀.
+
+            strong = jm.Isometric().at_level(0.6)
+
+            P_w, F_ext ∝ L,   k_j ∝ κ(L) = resting + (1 - resting) L,   c_j ∝ κ(L)^damping
+            coefficient of variation of the output ∝ g(L) = relative_variation(L)
+
+        The last is what has been measured; all amplitudes of noise and harmonic are multiplied by
+        the one number that makes the expected (linear-response) value follow it, from the task's
+        own at L₀. With `resting = 0` the operating point does not move and force is proportional to
+        L. `task.at_level(reference)` is the task; two steps make one. It means the same in every
+        task: P_w is prescribed in `Isometric` and `PrescribedForce`, in `PrescribedMotion` it
+        follows from F_ext.
+
+        **Arguments:**
+
+        - `mvc_fraction`, `reference`, `steadiest`: in (0, 1], fractions of the maximum voluntary
+          contraction
+        - `contrast` of g
+        - `resting` in [0, 1), the share of the stiffness at L = 1 that is there without activation
+        - `damping`: 1 keeps C/K, 0.5 the damping ratio
+
+        **Raises:** `ValueError` for a fraction outside (0, 1] (30 % is 0.3), for a task in which no
+        force is prescribed, for a muscle that is not made of the paper's quadratic laws;
+        `OperatingPointError` (a `ValueError`) where there is no stable equilibrium.
+
+        **Source:** stiffness proportional to force: Shadmehr & Arbib 1992, doi:10.1007/BF00204111
+        (muscle without reflexes). Both tissues alike, damping and the noise law: assumptions, see
+        docs/scaling.md.
+        """
+        law = {"reference": reference, "steadiest": steadiest, "contrast": contrast}
+        law |= {"resting": resting, "damping": damping}
+        return load_above("response._scaling").at_level(self, mvc_fraction, **law)
+
+    def scaled(
+        self: Task,
+        size: Scalar,
+        *,
+        time_exponent: Scalar = 1.0,
+        strength_exponent: Scalar = 0.25,
+    ) -> Task:
+        """A geometrically similar muscle, all lengths multiplied by `size` s, under the same
+        stress.
+
+            bigger = jm.Isometric().scaled(1.2)
+
+            x_ref, x_z ∝ s,   P_w, F_ext ∝ s²,   m ∝ s³,   K_0 ∝ s (k ∝ 1/s)
+            C_0 ∝ s^(1 + e),   v_ref ∝ s^(1 - e)
+            coefficient of variation of the output ∝ (s²)^(-strength_exponent)
+
+        e, `time_exponent`, says how intrinsic times grow: 1 is dynamic similarity, every rate ∝ 1/s
+        (velocities and damping ratio stay); 0 keeps C/K, as a material of given viscosity would.
+        Strength is s²; 1/2 as exponent is independent motor units, as many as strength asks for.
+        All amplitudes of noise and harmonic are multiplied by the one number that makes the
+        expected coefficient of variation follow. Frequency and cut-off of harmonic and noise, times
+        of inputs and spectrum settings stay: they are the nervous system's and the experimenter's.
+
+        **Arguments:** `size` > 0, the ratio of lengths; the two exponents.
+
+        **Raises:** `ValueError` for a size that is not positive, for a muscle that is not made of
+        the paper's quadratic laws; `OperatingPointError` (a `ValueError`) where there is no stable
+        equilibrium.
+
+        **Source:** times ∝ length: Hill 1950, Sci Prog 38:209-230. Variation falling with strength,
+        mainly by the number of motor units: Hamilton, Jones & Wolpert 2004,
+        doi:10.1007/s00221-004-1856-7. The exponent 0.25 is an assumption, see docs/scaling.md.
+        """
+        return load_above("response._scaling").scaled(self, size, time_exponent, strength_exponent)
+
+    def save(
+        self, path: str | Path, *, description: str = "", fit: dict[str, Any] | None = None
+    ) -> None:
+        """Write the task to `path` as a preset: TOML with a description and the task table.
+
+            jm.Isometric(k_w=4e5).save("mine.toml")
+            task = jm.load_preset("mine.toml")
+
+        `load_preset` reads it back equal. `fit`, a dictionary that says how the task was fitted, is
+        written as a note for the reader.
+        """
+        load_above("response._presets").save_preset(path, self, description, fit)
 
     def check_step(self, dt: float) -> None:
         """Raise a `ValueError` if a grid of step dt [s] is too coarse for noise or activation."""

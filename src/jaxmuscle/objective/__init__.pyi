@@ -1,6 +1,5 @@
 """Public names of this wing."""
 
-from ._arguments import task_for as task_for
 from ._free import Free as Free
 from ._free import free as free
 from ._likelihood import log_likelihood as log_likelihood

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -15,24 +15,16 @@ from jaxmuscle._common.keys import key_of
 from jaxmuscle.data._frequency_response import check_seen
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
-from jaxmuscle.model._noise import AbstractNoise
-from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import (
     PARAMETERS,
     USUALLY_FREE,
     unknown_parameter,
     usually_free,
 )
-from jaxmuscle.model._tasks import (
-    AbstractTask,
-    Isometric,
-    Observed,
-    PrescribedForce,
-    PrescribedLength,
-)
+from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedLength
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
-from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
+from jaxmuscle.response._scaling import FORCES, is_scalable
 from jaxmuscle.spectra._settings import WINDOW, samples_in
 
 from ._coordinates import Coordinates
@@ -52,29 +44,6 @@ MOVING = (3.0, 20.0)
 SLOWER = (0.5, 6.0)
 # free where the insertion moves: a perturbation tells m_z, and m_w widens the errors
 MASSES = ("m_w", "m_z")
-
-
-def task_for(
-    target: Target,
-    kind: type[AbstractTask] | None = None,
-    *,
-    noise: str | AbstractNoise | None = None,
-) -> AbstractTask:
-    """The task that a target measured: `Isometric` for force and torque, `PrescribedLength` for a
-    dynamic stiffness, `PrescribedForce` for displacement and acceleration (with
-    `observe="acceleration"`).
-
-        target = jm.load_target("vastus-lateralis-26mvc")
-        task = jm.task_for(target, noise="pink")
-
-    Of another `kind` if one is given. It has the target's spectrum settings and default parameters;
-    `noise` is "white", "band-limited", "ornstein-uhlenbeck", "pink", or a noise object.
-    """
-    what: Any = target.quantity
-    held = Isometric() if target.stiffness is None else PrescribedLength()
-    task = PrescribedForce(observe=what) if what in get_args(Observed) else held
-    task = task if kind in (None, type(task)) else kind()
-    return with_noise(task.with_parts(settings=target.settings), noise)
 
 
 def check_quantity(task: AbstractTask, target: Target, name: str, remedy: str) -> None:
@@ -166,7 +135,7 @@ def at_mean(
     if stated is None or level is None or level in (options.fix or {}):
         return task, options
     free = (*options.also_free, level)
-    moved = at_force(task, stated[0])
+    moved = task.at_force(stated[0])
     factor = float(moved["m_w"]) / float(task["m_w"])
     # masses are not in ratio to forces where displacements are known
     if target.stiffness is not None:
@@ -208,7 +177,7 @@ def planned(
             task,
             target,
             target.name,
-            "fit jaxmuscle.task_for(target), or state the target's quantity",
+            "fit target.task(), or state the target's quantity",
         )
     check_stiffness(task, target)
     names = free_names(task, options.free, fix, target)
@@ -333,7 +302,7 @@ def _check_mean(
     raise ValueError(
         f"mean_force = {value:g} N cannot be reached: in Isometric the measured force lies between"
         f" 0 and the active force, which is P_w = {most:g} N here, whatever the stiffnesses. Carry"
-        f" the muscle to that force first: task = jaxmuscle.at_force(task, {value:g})"
+        f" the muscle to that force first: task = task.at_force({value:g})"
     )
 
 

@@ -355,7 +355,7 @@ def log_likelihood(task: AbstractTask, data: Target | TargetData | Recording) ->
     """Log likelihood of measured data under a task in linear response; differentiable in the task.
 
         target = jm.load_target("vastus-lateralis-26mvc")
-        jm.objective.log_likelihood(jm.task_for(target), target)
+        jm.objective.log_likelihood(target.task(), target)
 
     A `Target` with segments: its Welch bins are correlated gamma variables about the expected
     spectrum (docs/uncertainty.md, *The likelihood*), their unknown total integrated out; with its

@@ -1,4 +1,4 @@
-"""The options of a fit, declared once: what `fit`, `fit_joint`, `fit_cohort` and `problem` take as
+"""The options of a fit, declared once: what `fit`, `fit_cohort` and `problem` take as
 keywords (their docstrings say what each does)."""
 
 import dataclasses
@@ -45,6 +45,22 @@ class SimulationOptions(SearchOptions, total=False):
     seeds: int | None
     check_seeds: int | None
     rungs: int | None
+
+
+class OneFitOptions(SimulationOptions, total=False):
+    """And of one target."""
+
+    method: str
+    mean_force: tuple[float, float] | Literal[False] | None
+    dt: float
+
+
+class JointFitOptions(SimulationOptions, total=False):
+    """And of several targets together."""
+
+    separate: Iterable[str]
+    proportional: Iterable[str]
+    mean_force: Mapping[str, tuple[float, float]] | None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,6 @@ from jaxmuscle._common.bundled import bundled_text
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._tasks import AbstractTask, Isometric
 from jaxmuscle.response._expected import response
-from jaxmuscle.response._scaling import at_level
 from jaxmuscle.spectra._measures import approximate_entropy
 from jaxmuscle.spectra._settings import WINDOW
 from jaxmuscle.spectra._welch import Spectrum
@@ -93,7 +92,7 @@ def _carry(
 
     def one(fraction):
         moments, _ = response(
-            as_arrays(at_level(task, fraction, reference=reference)), task.settings, WINDOW
+            as_arrays(task.at_level(fraction, reference=reference)), task.settings, WINDOW
         )
         return jnp.asarray(moments.power), jnp.asarray(moments.variation)
 
@@ -105,7 +104,7 @@ def levels() -> Levels:
     %."""
     high, low = fitted(95), fitted(35)
     power, variation = _carry_to(high, [*LEVELS, STEADIEST], 0.95)
-    entropy = [_entropies(at_level(high, fraction, reference=0.95)) for fraction in LEVELS.tolist()]
+    entropy = [_entropies(high.at_level(fraction, reference=0.95)) for fraction in LEVELS.tolist()]
     louder = SMALLEST / variation[-1]  # to first order amplitudes and variation are proportional
     # as many levels as above, so that one program serves both
     beside, _ = _carry_to(low, [0.35] * len(LEVELS) + [0.95], 0.35)

@@ -18,7 +18,9 @@ def reproduce(
 ) -> Reproduction:
     """Compute, draw and write the paper's figures and the table of its statements.
 
-        jm.reproduce("out/reproduce")
+        from jaxmuscle import paper
+
+        paper.reproduce("out/reproduce")
 
     Writes fig2, fig3, fig4a, fig4b, fig5, fig6a, fig6b, fig7, fig8 as .png and .pdf, claims.json
     and index.html.

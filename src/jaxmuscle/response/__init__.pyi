@@ -10,12 +10,7 @@ from ._input_response import dynamic_stiffness as dynamic_stiffness
 from ._input_response import noise_density as noise_density
 from ._linear_task import Linearisation as Linearisation
 from ._linearised import linearise as linearise
-from ._linearised import settled as settled
 from ._presets import load_preset as load_preset
-from ._presets import save_preset as save_preset
-from ._scaling import at_force as at_force
-from ._scaling import at_level as at_level
 from ._scaling import relative_variation as relative_variation
-from ._scaling import scaled as scaled
 from ._sensitivity import Sensitivity as Sensitivity
 from ._sensitivity import sensitivity as sensitivity

@@ -12,11 +12,11 @@ from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._signals import AbstractSignal, Harmonic
+from jaxmuscle.model._task import HOLD as HOLD
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-HOLD = 15.0
 GUESS = 1e-3
 
 

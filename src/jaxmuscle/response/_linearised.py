@@ -60,13 +60,7 @@ def linearisation(task: AbstractTask, time: float = HOLD) -> Linearisation:
 
 
 def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
-    """The task with its inputs held at their values at `time` [s] from the start, and starting from
-    equilibrium.
-
-        run = jm.simulate(jm.settled(jm.Isometric()), jax.random.key(0), duration=10.0)
-
-    Its simulation has no rise and no transient of the mean: what the linear response describes.
-    """
+    """See `AbstractTask.settled`."""
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
     point = (
         equilibrium(task, time) if traced else np.asarray(linearisation(task, time).point).tolist()
@@ -141,7 +135,7 @@ def check_inputs(task: AbstractTask, window: tuple[float, float] = WINDOW) -> No
                 f" s it is {values[np.argmax(off)]:.3g}, at the end {values[-1]:.3g}. The linear"
                 f" response needs inputs that are held from {window[0]:g} s to {window[1]:g} s."
                 " Simulate instead, ensemble(task, key).spectrum(), or fit with"
-                " method='montecarlo'; or hold the input: settled(task)"
+                " method='montecarlo'; or hold the input: task.settled()"
             )
 
 

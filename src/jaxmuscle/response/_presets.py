@@ -17,8 +17,6 @@ from jaxmuscle._common.units import NEWTONS
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import AbstractTask
 
-from ._scaling import at_force
-
 FORMAT = 2  # of a preset; 1 may leave out what a task does not have
 FIT_FORMAT = 5  # of a fit.json
 
@@ -33,10 +31,10 @@ def load_preset(name_or_path: str | Path) -> AbstractTask:
         mean = 40.5
         unit = "N"          # or "mN", "kN", "kgf", "gf", "lbf"
 
-    Then the task is scaled to that force by `at_force`: P_w and F_ext, masses, stiffness and
+    Then the task is scaled to that force by `task.at_force`: P_w and F_ext, masses, stiffness and
     damping are multiplied by one number. Proportional power and the coefficient of variation stay.
     A fit that starts from the task has its priors centred on the new values. A file of
-    `save_preset` and a `fit.json` hold the final numbers and state no mean.
+    `task.save` and a `fit.json` hold the final numbers and state no mean.
 
     **Raises:** `PresetError` naming the file or the nearest bundled name, and what is wrong: also a
     unit that is not one of these, a mean of zero or of the other sign, and a task whose output is
@@ -136,26 +134,15 @@ def _carried(task: AbstractTask, mean: Any, unit: Any) -> AbstractTask:
     if isinstance(mean, bool) or not isinstance(mean, int | float) or not math.isfinite(mean):
         raise PresetError(f"mean = {mean!r}: give the mean force in {unit} as one number")
     try:
-        return at_force(task, NEWTONS[unit] * mean)
+        return task.at_force(NEWTONS[unit] * mean)
     except ValueError as error:
         raise PresetError(f"mean = {mean} {unit}: {error}") from None
 
 
 def save_preset(
-    path: str | Path,
-    task: AbstractTask,
-    *,
-    description: str = "",
-    fit: dict[str, Any] | None = None,
+    path: str | Path, task: AbstractTask, description: str, fit: dict[str, Any] | None
 ) -> None:
-    """Write a task to `path` as a preset: TOML with a description and the task table.
-
-        jm.save_preset("mine.toml", jm.Isometric(k_w=4e5))
-        task = jm.load_preset("mine.toml")
-
-    `load_preset` reads it back equal. `fit`, a dictionary that says how the task was fitted, is
-    written as a note for the reader.
-    """
+    """See `AbstractTask.save`."""
     table: dict[str, Any] = {"format": FORMAT, "description": description} | (
         {"fit": fit} if fit else {}
     )

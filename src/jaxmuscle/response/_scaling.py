@@ -60,44 +60,13 @@ def at_level(
     task: AbstractTask,
     mvc_fraction: Scalar,
     *,
-    reference: Scalar = 0.3,
-    steadiest: Scalar = 0.3,
-    contrast: Scalar = 1.0,
-    resting: Scalar = 0.0,
-    damping: Scalar = 1.0,
+    reference: Scalar,
+    steadiest: Scalar,
+    contrast: Scalar,
+    resting: Scalar,
+    damping: Scalar,
 ) -> AbstractTask:
-    """The task at another level of contraction, `mvc_fraction` L; as it is, it stands for
-    `reference` L₀.
-
-        strong = jm.response.at_level(jm.Isometric(), 0.6)
-
-        P_w, F_ext ∝ L,   k_j ∝ κ(L) = resting + (1 - resting) L,   c_j ∝ κ(L)^damping
-        coefficient of variation of the output ∝ g(L) = relative_variation(L)
-
-    The last is what has been measured; all amplitudes of noise and harmonic are multiplied by the
-    one number that makes the expected (linear-response) value follow it, from the task's own at L₀.
-    With `resting = 0` the operating point does not move and force is proportional to L.
-    `at_level(task, reference)` is the task; two steps make one. It means the same in every task:
-    P_w is prescribed in `Isometric` and `PrescribedForce`, in `PrescribedMotion` it follows from
-    F_ext.
-
-    **Arguments:**
-
-    - `mvc_fraction`, `reference`, `steadiest`: in (0, 1], fractions of the maximum voluntary
-      contraction
-    - `contrast` of g
-    - `resting` in [0, 1), the share of the stiffness at L = 1 that is there without activation
-    - `damping`: 1 keeps C/K, 0.5 the damping ratio
-
-    **Returns:** a task of the same kind. **Raises:** `ValueError` for a fraction outside (0, 1] (30
-    % is 0.3), for a task in which no force is prescribed, for a muscle that is not made of the
-    paper's quadratic laws; `OperatingPointError` (a `ValueError`) where there is no stable
-    equilibrium.
-
-    **Source:** stiffness proportional to force: Shadmehr & Arbib 1992, doi:10.1007/BF00204111
-    (muscle without reflexes). Both tissues alike, damping and the noise law: assumptions, see
-    docs/scaling.md.
-    """
+    """See `AbstractTask.at_level`."""
     _check_fraction("mvc_fraction", mvc_fraction)
     _check_fraction("reference", reference)
     require(
@@ -122,26 +91,7 @@ def at_level(
 
 
 def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
-    """The task scaled to another mean force: forces, masses, stiffness and damping multiplied by
-    one number.
-
-        task = jm.at_force(jm.Isometric(), 40.5)
-
-        P_w, F_ext, m_j, k_j, c_j ∝ s    (and noise in absolute units)
-        s = mean / (mean force of the task)
-
-    Every term of (1a) and (1b) is then s times what it was: displacements, times, proportional
-    power and the coefficient of variation stay to the last digit, forces are s times as large. So a
-    fit that starts from this task has its priors centred on these values, and a mean force in
-    newtons can be data (`fit(..., mean_force=)`).
-
-    **Arguments:** `mean` [N], of the sign of the task's own mean force.
-
-    **Returns:** a task of the same kind. **Raises:** `ValueError` for a task whose output is not a
-    force or has a mean of zero, a `mean` of zero or of the other sign, a muscle that is not made of
-    the paper's quadratic laws; `OperatingPointError` (a `ValueError`) where there is no stable
-    equilibrium.
-    """
+    """See `AbstractTask.at_force`."""
     if task.output_unit != "N":
         raise ValueError(
             f"the output of {type(task).__name__} is {task.output_name} in {task.output_unit}, not"
@@ -173,37 +123,9 @@ def times_force(task: AbstractTask, factor: Scalar) -> AbstractTask:
 
 
 def scaled(
-    task: AbstractTask,
-    size: Scalar,
-    *,
-    time_exponent: Scalar = 1.0,
-    strength_exponent: Scalar = 0.25,
+    task: AbstractTask, size: Scalar, time_exponent: Scalar, strength_exponent: Scalar
 ) -> AbstractTask:
-    """A geometrically similar muscle, all lengths multiplied by `size` s, under the same stress.
-
-        bigger = jm.response.scaled(jm.Isometric(), 1.2)
-
-        x_ref, x_z ∝ s,   P_w, F_ext ∝ s²,   m ∝ s³,   K_0 ∝ s (k ∝ 1/s)
-        C_0 ∝ s^(1 + e),   v_ref ∝ s^(1 - e)
-        coefficient of variation of the output ∝ (s²)^(-strength_exponent)
-
-    e, `time_exponent`, says how intrinsic times grow: 1 is dynamic similarity, every rate ∝ 1/s
-    (velocities and damping ratio stay); 0 keeps C/K, as a material of given viscosity would.
-    Strength is s²; 1/2 as exponent is independent motor units, as many as strength asks for. All
-    amplitudes of noise and harmonic are multiplied by the one number that makes the expected
-    coefficient of variation follow. Frequency and cut-off of harmonic and noise, times of inputs
-    and spectrum settings stay: they are the nervous system's and the experimenter's.
-
-    **Arguments:** `size` > 0, the ratio of lengths; the two exponents.
-
-    **Returns:** a task of the same kind. **Raises:** `ValueError` for a size that is not positive,
-    for a muscle that is not made of the paper's quadratic laws; `OperatingPointError` (a
-    `ValueError`) where there is no stable equilibrium.
-
-    **Source:** times ∝ length: Hill 1950, Sci Prog 38:209-230. Variation falling with strength,
-    mainly by the number of motor units: Hamilton, Jones & Wolpert 2004,
-    doi:10.1007/s00221-004-1856-7. The exponent 0.25 is an assumption, see docs/scaling.md.
-    """
+    """See `AbstractTask.scaled`."""
     require(
         size > 0, f"size = {size} must be positive: the ratio of lengths, 1 for the same muscle"
     )

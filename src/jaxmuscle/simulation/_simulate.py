@@ -124,7 +124,7 @@ def companion(task: AbstractTask, duration: float, *, required: bool) -> LinearT
             raise ValueError(
                 f"control = True: duration = {duration} s must reach {WINDOW[1]} s, and by"
                 f" {WINDOW[0]} s the slowest motion must have decayed to {TRANSIENT:g} of its"
-                f" start, but {left:.2g} is left: simulate settled(task)"
+                f" start, but {left:.2g} is left: simulate task.settled()"
             )
         return None
     return linear

@@ -72,7 +72,7 @@ WORDS = {
 NO_NOISE = (
     "no further measurement is tried: the fit has no spectrum, so the noise that limits a"
     " measurement is not known. Fit the recording of both channels, or a spectrum beside the"
-    " response (fit_joint)"
+    " response (fit of several targets)"
 )
 FITTED_TOO = "fitted in this measurement"
 BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
