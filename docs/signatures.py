@@ -14,7 +14,7 @@ TABLE = ast.parse(
 ROWS = [
     n.args
     for n in ast.walk(TABLE)
-    if isinstance(n, ast.Call) and ast.unparse(n.func) in ("_row", "_free_sign")
+    if isinstance(n, ast.Call) and ast.unparse(n.func) in ("Parameter", "_free_sign")
 ]
 DEFAULTS = {
     ast.unparse(row[0]).strip("'"): ast.unparse(row[3])

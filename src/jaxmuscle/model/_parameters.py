@@ -39,41 +39,6 @@ _TREMOR = "physiological tremor of hand and wrist, 8 to 12 Hz (Elble & Koller 19
 _SLOW = "a slower oscillation of wrist force seen near 3 to 4 Hz"
 
 
-def _row(  # noqa: PLR0913 (the columns of the table)
-    name,
-    symbol,
-    unit,
-    default,
-    meaning,
-    source,
-    lower=0.0,
-    upper=math.inf,
-    sd=1.0,
-    positive=True,
-    **bounds,
-):
-    return Parameter(
-        name, symbol, unit, default, lower, upper, sd, positive, meaning, source, **bounds
-    )
-
-
-def _free_sign(name, symbol, unit, default, meaning, source, sd):
-    bounds = {"fit_lower": -math.inf, "fit_upper": math.inf}
-    return _row(
-        name,
-        symbol,
-        unit,
-        default,
-        meaning,
-        source,
-        -math.inf,
-        math.inf,
-        sd,
-        positive=False,
-        **bounds,
-    )
-
-
 DEFAULT_FREE = (
     "k_w",
     "k_z",
@@ -113,12 +78,12 @@ class Parameter(NamedTuple):
     symbol: str
     unit: str
     default: float
-    lower: float
-    upper: float
-    prior_sd: float
-    positive: bool
     meaning: str
     source: str
+    lower: float = 0.0
+    upper: float = math.inf
+    prior_sd: float = 1.0
+    positive: bool = True
     fit_lower: float = 0.0
     fit_upper: float = math.inf
 
@@ -133,25 +98,31 @@ class Parameter(NamedTuple):
         return f"{low} or more" if high is None else f"{low} to {high}"
 
 
+def _free_sign(name, symbol, unit, default, meaning, source, prior_sd):
+    free = dict.fromkeys(("lower", "fit_lower"), -math.inf)
+    row = Parameter(name, symbol, unit, default, meaning, source, prior_sd=prior_sd)
+    return row._replace(positive=False, **free)
+
+
 PARAMETERS: dict[str, Parameter] = {
     row.name: row
     for row in (
         # no data tell it: its prior goes into all errors
-        _row("m_w", "m_w", "kg", 0.5, "active mass", _HAND, sd=0.5),
-        _row("m_z", "m_z", "kg", 0.5, "passive mass", _HAND),
-        _row("k_w", "k_w", "N/m^3", 5e5, "active stiffness factor", _STIFF),
-        _row("k_z", "k_z", "N/m^3", 5e5, "passive stiffness factor", _STIFF),
-        _row("c_w", "c_w", "N s^3/m^3", 60.0, "active damping factor", _DAMP),
-        _row("c_z", "c_z", "N s^3/m^3", 5.0, "passive damping factor", _DAMP),
-        _row("x_ref_w", "x_ref,w", "m", 0.02, "active reference displacement", _REF),
-        _row("x_ref_z", "x_ref,z", "m", 0.02, "passive reference displacement", _REF),
-        _row("v_ref_w", "v_ref,w", "m/s", 1.0, "active reference velocity", _REF_V),
-        _row("v_ref_z", "v_ref,z", "m/s", 1.0, "passive reference velocity", _REF_V),
-        _row("noise_K_w", "σ_Kw/K_w0", "1", 0.15, "noise on active stiffness", _PAPER_K),
-        _row("noise_K_z", "σ_Kz/K_z0", "1", 0.005, "noise on passive stiffness", _PAPER_K),
-        _row("noise_C_w", "σ_Cw/C_w0", "1", 1e-4, "noise on active damping", _PAPER_C),
-        _row("noise_C_z", "σ_Cz/C_z0", "1", 1e-4, "noise on passive damping", _PAPER_C),
-        _row(
+        Parameter("m_w", "m_w", "kg", 0.5, "active mass", _HAND, prior_sd=0.5),
+        Parameter("m_z", "m_z", "kg", 0.5, "passive mass", _HAND),
+        Parameter("k_w", "k_w", "N/m^3", 5e5, "active stiffness factor", _STIFF),
+        Parameter("k_z", "k_z", "N/m^3", 5e5, "passive stiffness factor", _STIFF),
+        Parameter("c_w", "c_w", "N s^3/m^3", 60.0, "active damping factor", _DAMP),
+        Parameter("c_z", "c_z", "N s^3/m^3", 5.0, "passive damping factor", _DAMP),
+        Parameter("x_ref_w", "x_ref,w", "m", 0.02, "active reference displacement", _REF),
+        Parameter("x_ref_z", "x_ref,z", "m", 0.02, "passive reference displacement", _REF),
+        Parameter("v_ref_w", "v_ref,w", "m/s", 1.0, "active reference velocity", _REF_V),
+        Parameter("v_ref_z", "v_ref,z", "m/s", 1.0, "passive reference velocity", _REF_V),
+        Parameter("noise_K_w", "σ_Kw/K_w0", "1", 0.15, "noise on active stiffness", _PAPER_K),
+        Parameter("noise_K_z", "σ_Kz/K_z0", "1", 0.005, "noise on passive stiffness", _PAPER_K),
+        Parameter("noise_C_w", "σ_Cw/C_w0", "1", 1e-4, "noise on active damping", _PAPER_C),
+        Parameter("noise_C_z", "σ_Cz/C_z0", "1", 1e-4, "noise on passive damping", _PAPER_C),
+        Parameter(
             "noise_cutoff",
             "f_c",
             "Hz",
@@ -159,7 +130,7 @@ PARAMETERS: dict[str, Parameter] = {
             "corner of band-limited noise",
             "half of 100 Hz, to which recordings are resampled",
         ),
-        _row(
+        Parameter(
             "noise_correlation_time",
             "τ",
             "s",
@@ -169,8 +140,8 @@ PARAMETERS: dict[str, Parameter] = {
             fit_lower=0.005,
             fit_upper=5.0,
         ),
-        _row("harmonic_amplitude", "A/K_0", "1", 0.003, "harmonic amplitude", _HUMAN),
-        _row(
+        Parameter("harmonic_amplitude", "A/K_0", "1", 0.003, "harmonic amplitude", _HUMAN),
+        Parameter(
             "harmonic_frequency",
             "f_S",
             "Hz",
@@ -180,7 +151,7 @@ PARAMETERS: dict[str, Parameter] = {
             fit_lower=0.2,
             fit_upper=30.0,
         ),
-        _row(
+        Parameter(
             "noise_P_w",
             "σ_Pw",
             "1",
@@ -188,76 +159,76 @@ PARAMETERS: dict[str, Parameter] = {
             "noise on the drive, a fraction of P_w; off by default",
             _HUMAN,
         ),
-        _row(
+        Parameter(
             "activation_time",
             "T",
             "s",
             0.06,
             "contraction time of a twitch; 0, the default of a task, is none",
             _TWITCH,
-            sd=1.0,
+            prior_sd=1.0,
             fit_lower=0.005,
             fit_upper=0.5,
         ),
-        _row(
+        Parameter(
             "resonance_amplitude",
             "σ_1",
             "1",
             0.005,
             "resonance of the drive (a tremor), a fraction of P_w",
             _HUMAN,
-            sd=2.0,
+            prior_sd=2.0,
         ),
-        _row(
+        Parameter(
             "resonance_frequency",
             "f_1",
             "Hz",
             9.0,
             "frequency of the resonance",
             _TREMOR,
-            sd=0.25,
+            prior_sd=0.25,
             fit_lower=0.5,
             fit_upper=30.0,
         ),
-        _row(
+        Parameter(
             "resonance_width",
             "b_1",
             "Hz",
             2.0,
             "full width of the resonance at half power",
             _TREMOR,
-            sd=0.7,
+            prior_sd=0.7,
             fit_lower=0.02,
             fit_upper=15.0,
         ),
-        _row(
+        Parameter(
             "resonance_2_amplitude",
             "σ_2",
             "1",
             0.005,
             "a second resonance of the drive, a fraction of P_w",
             _HUMAN,
-            sd=2.0,
+            prior_sd=2.0,
         ),
-        _row(
+        Parameter(
             "resonance_2_frequency",
             "f_2",
             "Hz",
             3.5,
             "frequency of the second resonance",
             _SLOW,
-            sd=0.35,
+            prior_sd=0.35,
             fit_lower=0.5,
             fit_upper=30.0,
         ),
-        _row(
+        Parameter(
             "resonance_2_width",
             "b_2",
             "Hz",
             1.0,
             "full width of the second resonance at half power",
             _SLOW,
-            sd=0.7,
+            prior_sd=0.7,
             fit_lower=0.02,
             fit_upper=15.0,
         ),
@@ -270,7 +241,7 @@ PARAMETERS: dict[str, Parameter] = {
             "unknown; hardly any influence above 1 Hz",
             math.pi,
         ),
-        _row(
+        Parameter(
             "P_w",
             "P_w",
             "N",

@@ -417,27 +417,24 @@ def in_numbers(value: Any) -> str:
     return f"{numbers.size} of {low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
 
 
-def fill(task: AbstractTask, fields: Mapping[str, Any], parameters: Mapping[str, Any]) -> None:
-    """Set the fields of a task that is being made, None to its default, a noise by its name; then
-    parameters by theirs."""
-    empty = {
-        "muscle": Muscle,
-        "noise": BandLimitedNoise,
-        "harmonic": Harmonic,
-        "settings": SpectrumSettings,
-    }
+def fill(task: AbstractTask, given: Mapping[str, Any]) -> None:
+    """Set the fields of a task that is being made, by their names: a part that is None or not given
+    to its default, a noise also by its own name. What is no field is a parameter: it is set then.
+    """
+    parameters = dict(given)
     for field in dataclasses.fields(task):
-        value = fields[field.name]
-        if value is None and field.name in empty:
-            value = empty[field.name]()
-        if field.name == "noise":
-            value = named_noise(value, task.smoothness_needed) if isinstance(value, str) else value
-        if field.name in PARTS and not (field.name == "activation" and value is None):
+        value = parameters.pop(field.name, None)
+        if field.name not in given or (value is None and field.name in PARTS):
+            made = field.default_factory
+            value = field.default if made is dataclasses.MISSING else made()
+        if field.name == "noise" and isinstance(value, str):
+            value = named_noise(value, task.smoothness_needed)
+        if field.name in PARTS and value is not None:
             value = proper_part(field.name, value)
         converter = field.metadata.get("converter")
         object.__setattr__(task, field.name, value if converter is None else converter(value))
     if parameters:
-        made = assigned(task, dict(parameters))
+        made = assigned(task, parameters)
         for field in dataclasses.fields(task):
             # its numbers are others than those that it was made with
             part = getattr(made, field.name)

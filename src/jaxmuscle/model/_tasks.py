@@ -1,6 +1,6 @@
 """Tasks: which end of the muscle is held or loaded, equations of motion, inputs and output."""
 
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -9,13 +9,10 @@ import jax.numpy as jnp
 from jaxmuscle._common.arrays import require
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Scalar
-from jaxmuscle.spectra._settings import SpectrumSettings
 
-from ._activation import Activation
 from ._muscle import AbstractMuscle, Perturbation
-from ._noise import AbstractNoise
 from ._parameters import PARAMETERS, default
-from ._signals import AbstractSignal, Harmonic, as_held, as_level, as_signal, derivatives
+from ._signals import AbstractSignal, as_held, as_level, as_signal, derivatives
 from ._task import AbstractTask, State, check_smooth, check_smooth_envelope, check_task, fill
 
 Observed = Literal["displacement", "acceleration"]
@@ -52,26 +49,9 @@ class PrescribedMotion(AbstractTask):
         self,
         x_z: "AbstractSignal | Scalar" = PARAMETERS["x_z"].default,
         F_ext: "AbstractSignal | Scalar" = 10.0,
-        *,
-        muscle: AbstractMuscle | None = None,
-        noise: AbstractNoise | str | None = None,
-        harmonic: Harmonic | None = None,
-        activation: Activation | None = None,
-        settings: SpectrumSettings | None = None,
-        initial: "tuple[Scalar, ...] | None" = None,
-        **parameters: "Scalar",
+        **parts: Any,
     ):
-        fields = dict(
-            x_z=x_z,
-            F_ext=F_ext,
-            muscle=muscle,
-            noise=noise,
-            harmonic=harmonic,
-            activation=activation,
-            settings=settings,
-            initial=initial,
-        )
-        fill(self, fields, parameters)
+        fill(self, {"x_z": x_z, "F_ext": F_ext} | parts)
 
     def __check_init__(self):
         check_task(self)
@@ -126,32 +106,15 @@ class PrescribedForce(AbstractTask):
     state_names: ClassVar[tuple[str, ...]] = ("x_w", "v_w", "x_z", "v_z")
     state_units: ClassVar[tuple[str, ...]] = ("m", "m/s", "m", "m/s")
 
-    def __init__(  # noqa: PLR0913 (options of a public call)
+    def __init__(
         self,
         P_w: "AbstractSignal | Scalar" = PARAMETERS["P_w"].default,
         F_ext: "AbstractSignal | Scalar" = PARAMETERS["F_ext"].default,
         *,
         observe: Observed = "displacement",
-        muscle: AbstractMuscle | None = None,
-        noise: AbstractNoise | str | None = None,
-        harmonic: Harmonic | None = None,
-        activation: Activation | None = None,
-        settings: SpectrumSettings | None = None,
-        initial: "tuple[Scalar, ...] | None" = None,
-        **parameters: "Scalar",
+        **parts: Any,
     ):
-        fields = dict(
-            P_w=P_w,
-            F_ext=F_ext,
-            observe=observe,
-            muscle=muscle,
-            noise=noise,
-            harmonic=harmonic,
-            activation=activation,
-            settings=settings,
-            initial=initial,
-        )
-        fill(self, fields, parameters)
+        fill(self, {"P_w": P_w, "F_ext": F_ext, "observe": observe} | parts)
 
     def __check_init__(self):
         if self.observe not in get_args(Observed):
@@ -227,26 +190,9 @@ class PrescribedLength(AbstractTask):
         self,
         P_w: "AbstractSignal | Scalar" = PARAMETERS["P_w"].default,
         x_z: "AbstractSignal | Scalar" = PARAMETERS["x_z"].default,
-        *,
-        muscle: AbstractMuscle | None = None,
-        noise: AbstractNoise | str | None = None,
-        harmonic: Harmonic | None = None,
-        activation: Activation | None = None,
-        settings: SpectrumSettings | None = None,
-        initial: "tuple[Scalar, ...] | None" = None,
-        **parameters: "Scalar",
+        **parts: Any,
     ):
-        fields = dict(
-            P_w=P_w,
-            x_z=x_z,
-            muscle=muscle,
-            noise=noise,
-            harmonic=harmonic,
-            activation=activation,
-            settings=settings,
-            initial=initial,
-        )
-        fill(self, fields, parameters)
+        fill(self, {"P_w": P_w, "x_z": x_z} | parts)
 
     def __check_init__(self):
         check_task(self)
@@ -292,31 +238,6 @@ class Isometric(PrescribedLength):
     """
 
     x_z: Scalar = eqx.field(converter=as_level, default=default("x_z"))  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    def __init__(
-        self,
-        P_w: "AbstractSignal | Scalar" = PARAMETERS["P_w"].default,
-        x_z: "Scalar" = PARAMETERS["x_z"].default,
-        *,
-        muscle: AbstractMuscle | None = None,
-        noise: AbstractNoise | str | None = None,
-        harmonic: Harmonic | None = None,
-        activation: Activation | None = None,
-        settings: SpectrumSettings | None = None,
-        initial: "tuple[Scalar, ...] | None" = None,
-        **parameters: "Scalar",
-    ):
-        fields = dict(
-            P_w=P_w,
-            x_z=x_z,
-            muscle=muscle,
-            noise=noise,
-            harmonic=harmonic,
-            activation=activation,
-            settings=settings,
-            initial=initial,
-        )
-        fill(self, fields, parameters)
 
     def insertion(self, t: Scalar) -> tuple[Scalar, Scalar, Scalar]:
         x_z = jnp.asarray(self.x_z)

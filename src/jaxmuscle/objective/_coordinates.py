@@ -199,7 +199,7 @@ def _log(value: float) -> float:
 
 
 def _generic(name: str) -> Parameter:
-    return Parameter(name, name, "", 1.0, 0.0, np.inf, 1.0, True, "", "a user's own", 0.0, np.inf)
+    return Parameter(name, name, "", 1.0, "", "a user's own")
 
 
 def _both_or_none(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
