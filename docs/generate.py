@@ -119,8 +119,7 @@ value of a parameter with the `task_table`, the spectrum with the `target_table`
 stands under `measured` in the `target_table`. Earlier formats are not read: fit again."""
 PRESET = """TOML, format 2. `task.save` writes it and `load_preset` reads it. The `task_table` has every field of
 the task and of its parts. `type` is the class of a part. What a task does not have (`activation`; `initial`, the state
-from which a simulation begins; in its spectrum settings `filter_cutoff`, the low-pass) is written as `"none"`. Format 1
-has no key `format`, and may leave out what a task does not have."""
+from which a simulation begins; in its spectrum settings `filter_cutoff`, the low-pass) is written as `"none"`."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
 the same keys without `format`, and `null` for what is not stated. *If missing* is for the .toml."""
 STUDY = """A study is a table of recordings with options ([a study](../study.md)). `run_study` reads it. You can write it in

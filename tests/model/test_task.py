@@ -15,7 +15,6 @@ import references
 import jaxmuscle as jm
 from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle.model import Constant, Decay, RampHold, Sampled, SmoothStep
-from jaxmuscle.response._equilibrium import operating_point
 
 KEY = jax.random.key(3)
 TASKS = (jm.PrescribedMotion, jm.PrescribedForce, jm.Isometric)
@@ -118,10 +117,9 @@ def test_what_is_observed_is_saved(tmp_path):
     task.save(tmp_path / "task.toml")
     assert jm.load_preset(tmp_path / "task.toml") == task
     text = (tmp_path / "task.toml").read_text()
-    # which had no such key
-    old = text.replace('observe = "acceleration"', "").replace("format = 2", "format = 1")
-    (tmp_path / "old.toml").write_text(old)
-    assert getattr(jm.load_preset(tmp_path / "old.toml"), "observe") == "displacement"  # noqa: B009
+    (tmp_path / "less.toml").write_text(text.replace('observe = "acceleration"', ""))
+    with pytest.raises(jm.errors.PresetError, match=r"less.toml: task has no key 'observe'"):
+        jm.load_preset(tmp_path / "less.toml")
     (tmp_path / "wrong.toml").write_text(
         text.replace('observe = "acceleration"', 'observe = "velocity"')
     )
@@ -259,7 +257,7 @@ def test_an_operating_point_that_does_not_exist_is_an_error():
     with pytest.raises(
         OperatingPointError, match=r"PrescribedForce has no equilibrium at t = 15.0 s"
     ):
-        operating_point(task)
+        jm.response.linearise(task)
 
 
 def test_eigenvalues_at_rest_are_those_of_the_linear_chain(x64):
@@ -272,7 +270,7 @@ def test_eigenvalues_at_rest_are_those_of_the_linear_chain(x64):
     )
     inverse = np.diag([1 / p["m_w"], 1 / p["m_z"]])
     chain = np.block([[np.zeros((2, 2)), np.eye(2)], [-inverse @ stiffness, -inverse @ damping]])
-    _, eigenvalues = operating_point(task)
+    eigenvalues = np.linalg.eigvals(jm.response.linearise(task).A)
     np.testing.assert_allclose(
         np.sort_complex(eigenvalues), np.sort_complex(np.linalg.eigvals(chain)), rtol=1e-8
     )

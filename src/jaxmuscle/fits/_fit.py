@@ -141,6 +141,11 @@ def fit(
     """
     if isinstance(target, Mapping):
         check_options(fit, JointFitOptions, options)
+        require(
+            task is None or isinstance(task, Mapping),
+            f"task: one {type(task).__name__}, but several targets. Of one person: give {{name:"
+            " task}, or None for the task of each target; of several people: use fit_cohort",
+        )
         return fit_jointly(task, target, progress, answer, **options)
     check_options(fit, OneFitOptions, options)
     require_task(task, "fit(task, target)")

@@ -51,11 +51,6 @@ def fit_jointly(
     **options: Any,
 ) -> FitResult:
     """The fit of several targets, see `fit`."""
-    if tasks is not None and not isinstance(tasks, Mapping):
-        raise ValueError(
-            f"task: one {type(tasks).__name__}, but several targets. Of one person: give {{name:"
-            " task}, or None for the task of each target; of several people: use fit_cohort"
-        )
     usual: dict[str, Any] = {"starts": 32, "seeds": 32, "check_seeds": 0}
     asked = FitOptions(**usual | options)
     rungs = asked.rungs or 0

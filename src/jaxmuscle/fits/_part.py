@@ -328,7 +328,7 @@ def read_part(table: PartTable) -> FittedPart:
     target = Target.from_table(table.target_table, whole=True)
     return FittedPart(
         target=target,
-        task=task_from_table(table.task_table, whole=True),
+        task=task_from_table(table.task_table),
         chi2_per_bin=table.chi2_per_bin,
         rms_log_error=table.rms_log_error,
         **{field: from_nulls(getattr(spectrum, field)) for field in SPECTRUM},

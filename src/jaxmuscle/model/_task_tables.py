@@ -102,39 +102,28 @@ def _to_table(value: Any) -> Any:
     return [_to_table(each) for each in value] if isinstance(value, tuple) else value
 
 
-def task_from_table(table: dict[str, Any], *, whole: bool = True) -> AbstractTask:
+def task_from_table(table: dict[str, Any]) -> AbstractTask:
     """The task of a table. Raises `PresetError` naming the key that is missing, unknown or wrong:
-    nothing gets a default.
-
-    Without `whole` what a task does not have may be left out, as the first format did.
-    """
+    nothing gets a default."""
     table = dict(table)
     name = table.pop("task", None)
     if not isinstance(name, str) or name not in TASKS:
         raise PresetError(f"task = {name!r}: {choices(str(name), TASKS)}")
-    return _build(TASKS[name], table, "task", whole)
+    return _build(TASKS[name], table, "task")
 
 
-def _build(kind: type, table: dict[str, Any], where: str, whole: bool) -> Any:
+def _build(kind: type, table: dict[str, Any], where: str) -> Any:
     fields = {field.name: field for field in dataclasses.fields(kind)}
     for key in table:
         if key not in fields:
             raise PresetError(f"unknown key {where}.{key}: {choices(key, fields)}")
-    absent: dict[str, Any] = {}
-    if not whole:  # parts that a task need not have, and choices that are younger than the format
-        absent = {
-            name: ABSENT for name, field in fields.items() if NoneType in get_args(field.type)
-        }
-        absent |= {
-            name: field.default for name, field in fields.items() if isinstance(field.default, str)
-        }
     values = {}
     for name, field in fields.items():
-        if name not in table and name not in absent:
+        if name not in table:
             raise PresetError(
                 f"{where} has no key {name!r}: give it; a number that is not there gets no default"
             )
-        values[name] = _value(kind, field, (absent | table)[name], f"{where}.{name}", whole)
+        values[name] = _value(kind, field, table[name], f"{where}.{name}")
     if kind in (
         _white_noise.OrnsteinUhlenbeckNoise,
         _resonant_noise.ResonantNoise,
@@ -147,7 +136,7 @@ def _build(kind: type, table: dict[str, Any], where: str, whole: bool) -> Any:
         raise PresetError(f"{where}: {error}") from None
 
 
-def _value(kind: type, field: Any, value: Any, where: str, whole: bool) -> Any:
+def _value(kind: type, field: Any, value: Any, where: str) -> Any:
     """That of a field: a part, several, numbers, a switch or a word, as the class declares it."""
     options = (
         get_args(field.type) if get_origin(field.type) in (Union, UnionType) else (field.type,)
@@ -156,7 +145,7 @@ def _value(kind: type, field: Any, value: Any, where: str, whole: bool) -> Any:
         return None
     meant = options[0]
     if meant is SpectrumSettings:
-        return _settings(converted(value, dict, where, PresetError), where, whole)
+        return _settings(converted(value, dict, where, PresetError), where)
     if get_origin(meant) is tuple:
         inner = get_args(meant)[0]
         entries = [
@@ -164,21 +153,10 @@ def _value(kind: type, field: Any, value: Any, where: str, whole: bool) -> Any:
             for i, each in enumerate(converted(value, list, where, PresetError))
         ]
         return tuple(
-            _part(inner, each, at, whole) if _is_part(inner) else _number(each, at)
-            for each, at in entries
+            _part(inner, each, at) if _is_part(inner) else _number(each, at) for each, at in entries
         )
     if _is_part(meant):
-        # A number stands for a step with default times, so no file of today may hold one.
-        number = (
-            not whole
-            and issubclass(meant, _signals.AbstractSignal)
-            and field.metadata.get("converter") is not None
-        )
-        return (
-            _number(value, where)
-            if number and not isinstance(value, dict)
-            else _part(meant, value, where, whole)
-        )
+        return _part(meant, value, where)
     # one for each input, or what a user's class has
     several = "converter" in field.metadata or kind not in _KINDS.values()
     if hasattr(meant, "dims") and (float not in options or (several and isinstance(value, list))):
@@ -188,9 +166,9 @@ def _value(kind: type, field: Any, value: Any, where: str, whole: bool) -> Any:
     )
 
 
-def _settings(table: dict[str, Any], where: str, whole: bool) -> SpectrumSettings:
+def _settings(table: dict[str, Any], where: str) -> SpectrumSettings:
     try:
-        return SpectrumSettings.from_dict(table, whole=whole)
+        return SpectrumSettings.from_dict(table, whole=True)
     except ValueError as error:
         raise PresetError(f"{where}: {error}") from None
 
@@ -199,7 +177,7 @@ def _is_part(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, eqx.Module)
 
 
-def _part(kind: type, value: Any, where: str, whole: bool) -> Any:
+def _part(kind: type, value: Any, where: str) -> Any:
     table = converted(value, dict, where, PresetError)
     name, known = table.get("type"), _known()
     if not isinstance(name, str) or name not in known:
@@ -212,7 +190,7 @@ def _part(kind: type, value: Any, where: str, whole: bool) -> Any:
             f"{where}.type = {name!r} is of the wrong kind: give"
             f" {kind.__name__.removeprefix('Abstract')}"
         )
-    return _build(known[name], {k: v for k, v in table.items() if k != "type"}, where, whole)
+    return _build(known[name], {k: v for k, v in table.items() if k != "type"}, where)
 
 
 def _number(value: Any, where: str) -> float:

@@ -113,21 +113,6 @@ def slowest(system: Float[Array, "states states"]) -> Float[Array, ""]:
     return jnp.min(jnp.abs(jnp.linalg.eigvals(system)))
 
 
-def operating_point(task: AbstractTask, time: float = HOLD) -> tuple[np.ndarray, np.ndarray]:
-    """Equilibrium and its eigenvalues as numbers. Raises `OperatingPointError` if there is no
-    equilibrium."""
-    with jax.enable_x64(True):
-        # as many as for `fastest_rate`: one program
-        points, jacobians = _linearisations(mechanics(task), np.full(2, time))
-        if not np.all(np.isfinite(points[-1])):
-            raise OperatingPointError(
-                f"{type(task).__name__} has no equilibrium at t = {time} s under its inputs (K_w0,"
-                f" K_z0, C_w0, C_z0 = {np.asarray(as_arrays(task).muscle.base())}): a stiffness"
-                " must balance them"
-            )
-        return np.asarray(points[-1]), np.linalg.eigvals(np.asarray(jacobians[-1]))
-
-
 def fastest_rate(task: AbstractTask, duration: float) -> float:
     """Largest |eigenvalue| [1/s] at the start and under the inputs at mid-run and end, for the
     stability of a step."""

@@ -17,7 +17,7 @@ from jaxmuscle._common.units import NEWTONS
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import AbstractTask
 
-FORMAT = 2  # of a preset; 1 may leave out what a task does not have
+FORMAT = 2  # of a preset
 FIT_FORMAT = 5  # of a fit.json
 
 
@@ -58,7 +58,7 @@ def load_preset(name_or_path: str | Path) -> AbstractTask:
 class PresetFile(Table, kw_only=True):
     """A saved task."""
 
-    format: Annotated[Literal[1, 2], says("Version of the format", missing="format 1")] = 1
+    format: Annotated[Literal[2], says("Version of the format", missing="format 2")] = FORMAT
     description: Annotated[str, says("What the task is", missing="not described")] = ""
     mean: Annotated[
         Any,
@@ -85,7 +85,6 @@ class PresetFile(Table, kw_only=True):
 class _InFit(NamedTuple):
     """What a `fit.json` says about its task; the rest is read by `load_result`."""
 
-    format: int
     task_table: dict[str, Any]
     mean: None = None
     unit: None = None
@@ -103,13 +102,13 @@ def _checked(text: str, file: str, kind: str) -> PresetFile | _InFit:
             raise PresetError(
                 f"{file}: format = {formats!r}: is not a fit.json of format {FIT_FORMAT}"
             )
-        return _InFit(FORMAT, table["task_table"])
+        return _InFit(table["task_table"])
     return checked(table, PresetFile, file, PresetError)
 
 
 def _task_of(said: PresetFile | _InFit, file: str) -> AbstractTask:
     try:
-        task = task_from_table(said.task_table, whole=said.format > 1)
+        task = task_from_table(said.task_table)
         return (
             task
             if said.mean is None and said.unit is None

@@ -81,12 +81,7 @@ def at_level(
     more, less = (
         relative_variation(at, steadiest=steadiest, contrast=contrast) for at in (level, before)
     )
-    inputs = {
-        name: _times(getattr(task, name), level / before) for name in FORCES if hasattr(task, name)
-    }
-    moved = _with_coefficients(
-        task.with_parts(**inputs), stiffness=stiffer, damping=stiffer**damping
-    )
+    moved = _multiplied(task, force=level / before, stiffness=stiffer, damping=stiffer**damping)
     return _with_variation(moved, task, more / less)
 
 
@@ -113,9 +108,7 @@ def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
 def times_force(task: AbstractTask, factor: Scalar) -> AbstractTask:
     """Forces, masses, stiffness and damping (and noise in absolute units) multiplied by one
     number."""
-    inputs = {name: _times(getattr(task, name), factor) for name in FORCES if hasattr(task, name)}
-    moved = _with_coefficients(task.with_parts(**inputs), stiffness=factor, damping=factor)
-    moved = moved.replace(m_w=moved["m_w"] * factor, m_z=moved["m_z"] * factor)
+    moved = _multiplied(task, force=factor, mass=factor, stiffness=factor, damping=factor)
     absolute = [
         n for part in moved.noise.components if not part.relative for n in names_of(moved, part)
     ]
@@ -130,9 +123,7 @@ def scaled(
         size > 0, f"size = {size} must be positive: the ratio of lengths, 1 for the same muscle"
     )
     s, slower = _number(size), _number(size) ** _number(time_exponent)
-    parts: dict[str, Any] = {
-        name: _times(getattr(task, name), s**2) for name in FORCES if hasattr(task, name)
-    }
+    parts: dict[str, Any] = {}
     if hasattr(task, "x_z"):
         parts["x_z"] = _times(getattr(task, "x_z"), s)  # noqa: B009
     if task.initial is not None:
@@ -140,10 +131,8 @@ def scaled(
         parts["initial"] = tuple(
             v * units[unit] for v, unit in zip(task.initial, task.state_units, strict=True)
         )
-    moved = _with_coefficients(
-        task.with_parts(**parts), stiffness=s, damping=s * slower, length=s, velocity=s / slower
-    )
-    moved = moved.replace(m_w=moved["m_w"] * s**3, m_z=moved["m_z"] * s**3)
+    tissue = {"stiffness": s, "damping": s * slower, "length": s, "velocity": s / slower}
+    moved = _multiplied(task.with_parts(**parts), force=s**2, mass=s**3, **tissue)
     return _with_variation(moved, task, s ** (-2 * _number(strength_exponent)))
 
 
@@ -201,28 +190,34 @@ def is_scalable(muscle: Any) -> bool:
     return isinstance(muscle, Muscle) and laws == [QuadraticStiffness] * 2 + [QuadraticDamping] * 2
 
 
-def _with_coefficients(
+def _multiplied(
     task: AbstractTask,
     *,
+    force: Scalar,
     stiffness: Scalar,
     damping: Scalar,
+    mass: Scalar = 1.0,
     length: Scalar = 1.0,
     velocity: Scalar = 1.0,
 ) -> AbstractTask:
-    """K_j0, C_j0, x_ref and v_ref of both tissues multiplied by the four factors."""
+    """P_w and F_ext, and of both tissues K_j0, C_j0, m_j, x_ref and v_ref multiplied by the
+    factors."""
     if not is_scalable(task.muscle):
         raise ValueError(
             f"the muscle, a {type(task.muscle).__name__}, is not made of the paper's quadratic"
             " laws: change its own parameters with replace(...)"
         )
+    inputs = {name: _times(getattr(task, name), force) for name in FORCES if hasattr(task, name)}
     factors = {
+        "m": mass,
         "k": stiffness / length**2,
         "x_ref": length,
         "c": damping / velocity**2,
         "v_ref": velocity,
     }
     names = [(f"{name}_{j}", factor) for name, factor in factors.items() for j in "wz"]
-    return task.replace(**{name: task[name] * factor for name, factor in names})
+    values = {name: task[name] * factor for name, factor in names}
+    return task.with_parts(**inputs).replace(**values)
 
 
 def _with_variation(task: AbstractTask, before: AbstractTask, factor: Scalar) -> AbstractTask:
