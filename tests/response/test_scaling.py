@@ -1,6 +1,7 @@
 """Levels of contraction and sizes: what similarity makes exact, and what is published about the
 variation of force."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -392,3 +393,37 @@ def test_a_held_force_tells_no_length():
     half = task.replace(**{name: factor * task[name] for name, factor in factors.items()})
     one, other = (jm.expected_spectrum(each).power for each in (task, half))
     np.testing.assert_allclose(other, one, rtol=2e-4)  # single precision
+
+
+class Held(jm.model.AbstractTask):
+    """A task of the user's own: the isometric one, written anew."""
+
+    P_w: jm.model.Constant = eqx.field(default_factory=lambda: jm.model.Constant(5.0))
+    state_names = ("x_w", "v_w")
+    state_units = ("m", "m/s")
+    output_name = "F_ext"
+    output_unit = "N"
+    smoothness_needed = (0, 1, 0, 1, 0)
+
+    def vector_field(self, t, y, u):
+        force = self.muscle.drive(self.P_w(t), u) - self.muscle.active_force(y[0], y[1], u)
+        return jnp.stack([y[1], (force - self.output(t, y, u, u)) / self.muscle.m_w])
+
+    def output(self, t, y, u, du):
+        return -self.muscle.passive_force(y[0], y[1], 0.0, 0.0, u)
+
+
+def test_a_task_of_ones_own_has_the_methods(x64):
+    own, ours = Held(), jm.Isometric(jm.model.Constant(5.0))
+    for change in (
+        lambda task: task.at_force(40.0),
+        lambda task: task.at_level(0.6),
+        lambda task: task.scaled(1.2),
+        lambda task: task.settled(),
+    ):
+        moved, expected = change(own), change(ours)
+        assert type(moved) is Held
+        np.testing.assert_allclose(
+            [*moved.parameters.values()], [expected[n] for n in moved.parameters]
+        )
+        np.testing.assert_allclose(moved.initial or 0.0, expected.initial or 0.0)
