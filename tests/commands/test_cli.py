@@ -878,7 +878,7 @@ def test_the_paper_as_json(tmp_path, monkeypatch):
     row = Row(
         "key", "fitted", "[30]", "says", "ours", (1.0, np.nan), "how", "does not agree", "why"
     )
-    monkeypatch.setattr(jm, "reproduce", lambda *_, **__: None)
+    monkeypatch.setattr(paper, "reproduce", lambda *_, **__: None)
     monkeypatch.setattr(paper, "check", lambda found: (row,))
     found = strict(run("reproduce", "--json", "--out", tmp_path).stdout)
     assert found["claims"] == strict(claims_json((row,))) and found["claims"][0]["numbers"] == [
@@ -913,7 +913,7 @@ OVERWRITES = {
         ["fit.json", "identifiability.json"],
     ),
     "compare": ("comparison.compare_noise", ["compare", "{csv}"], ["compare.json"]),
-    "reproduce": ("reproduce", ["reproduce"], ["claims.json"]),
+    "reproduce": ("paper.reproduce", ["reproduce"], ["claims.json"]),
 }
 
 
