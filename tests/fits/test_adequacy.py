@@ -10,9 +10,9 @@ import scipy.stats
 from refits import without_intervals
 
 import jaxmuscle as jm
-from jaxmuscle.fits._adequacy import Endpoint, _misfit, elsewhere
 from jaxmuscle.fits._intervals import intervals
 from jaxmuscle.fits._refit import without_fitted
+from jaxmuscle.fits._verdict import Endpoint, _misfit, elsewhere
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import consequences, expand, quantities

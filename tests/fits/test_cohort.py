@@ -21,7 +21,7 @@ import jaxmuscle as jm
 from jaxmuscle.commands import cohort as _cli_cohort
 from jaxmuscle.commands.main import app
 from jaxmuscle.fits import Estimate
-from jaxmuscle.fits._fit_file import Adequacy
+from jaxmuscle.fits._result import Adequacy
 
 PEOPLE, SEEDS = 6, 20
 

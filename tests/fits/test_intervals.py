@@ -10,10 +10,9 @@ from scipy.interpolate import RectBivariateSpline
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.fits._half_power import half_power_intervals
 from jaxmuscle.fits._intervals import Interval, intervals
-from jaxmuscle.fits._part import Estimate
-from jaxmuscle.fits._tables import with_intervals
+from jaxmuscle.fits._report import with_intervals
+from jaxmuscle.fits._result import Estimate
 from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import consequences, consequences_of_rows, expand
 from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
@@ -198,7 +197,7 @@ def test_that_of_a_half_power_frequency_ends_where_its_profile_does(task, x64):
     either end."""
     problem, objective, seen = fitted(task, drawn(task, 45, 3))
     value, gain = consequences(objective, seen).values[0][NAME], inverse_curvature(objective, seen)
-    low, high = half_power_intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value)
+    low, high = intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value)
     assert low < value < high
     rises = rise(objective, seen, seen.theta + PLANE)
     np.testing.assert_allclose(
@@ -217,7 +216,7 @@ def test_about_a_shelf_there_is_no_interval(x64):
         max(lowest(level(SHELF, theta, f), rises) for f in np.geomspace(value, 2 * LAST, 8)[1:])
         < 1.96
     )
-    assert half_power_intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value) == (
+    assert intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value) == (
         None,
         None,
     )
@@ -237,9 +236,7 @@ def test_stated_intervals_hold_the_truth(x64):
         scatter = residual_covariance(problem.parts[0].target, objective.parts[0], np.zeros(30))
         covariance = parameter_covariance(found.jacobian, scatter, problem.precision)
         value = float(found.values[0][NAME])
-        low, high = half_power_intervals(problem, objective, seen, covariance, {NAME: 1.0})[
-            NAME
-        ].about(value)
+        low, high = intervals(problem, objective, seen, covariance, {NAME: 1.0})[NAME].about(value)
         if low is not None:
             held.append(low <= frequency_of(truth) <= high)
     assert len(held) >= 15 and len(held) - sum(held) <= scipy.stats.binom.isf(1e-4, len(held), 0.05)

@@ -16,8 +16,8 @@ import jaxmuscle as jm
 from jaxmuscle._common.errors import PresetError, ResultError
 from jaxmuscle._common.files import replacing, write_json, write_text
 from jaxmuscle.fits import Estimate
-from jaxmuscle.fits._fit_file import FORMAT, Adequacy, Rung, Start
 from jaxmuscle.fits._report import may_be_elsewhere
+from jaxmuscle.fits._result import FORMAT, Adequacy, Rung, Start
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 
 POWER = 1 / (1 + np.arange(1, 31) ** 2)

@@ -11,12 +11,18 @@ from refits import without_intervals
 from scipy.optimize import brentq
 
 import jaxmuscle as jm
-from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._checks import mass_notices, twitch_notices
-from jaxmuscle.fits._ladder import _fewer, criterion, first_rung
-from jaxmuscle.fits._part import Estimate
-from jaxmuscle.fits._peaks import find_slower_peak, find_tremor, find_unseen
+from jaxmuscle.fits._model_choice import (
+    _fewer,
+    criterion,
+    find_slower_peak,
+    find_tremor,
+    find_unseen,
+    first_rung,
+)
 from jaxmuscle.fits._reopened import reopened
+from jaxmuscle.fits._result import Estimate
+from jaxmuscle.fits._verdict import Endpoint
 from jaxmuscle.model._rungs import QUIET, RUNGS
 from jaxmuscle.objective._arguments import DAMPING_SD, planned
 from jaxmuscle.objective._consequences import expand

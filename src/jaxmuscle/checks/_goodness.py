@@ -17,9 +17,8 @@ from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._part import FittedPart
 from jaxmuscle.fits._reopened import reopened
-from jaxmuscle.fits._result import FitResult
+from jaxmuscle.fits._result import FitResult, FittedPart
 from jaxmuscle.objective._likelihood import Likelihood, drawn_spectra, require_spread
 from jaxmuscle.spectra._bin_law import bin_statistics
 

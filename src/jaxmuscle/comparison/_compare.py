@@ -13,7 +13,7 @@ from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._adequacy import Endpoint
+from jaxmuscle.fits._verdict import Endpoint
 from jaxmuscle.model._noises import NOISES, with_noise
 from jaxmuscle.model._parameters import (
     HARMONIC,

@@ -16,7 +16,7 @@ from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._adequacy import ADEQUATE
+from jaxmuscle.fits._verdict import ADEQUATE
 from jaxmuscle.model._rungs import RICHER, RUNGS
 from jaxmuscle.model._task_tables import task_to_table
 from jaxmuscle.model._tasks import AbstractTask

@@ -35,8 +35,7 @@ from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import BinStatistics, recorded_interval, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._fit_file import Start
-from ._part import Estimate, FittedPart
+from ._result import Estimate, FittedPart, Start
 
 AMBIGUOUS, OTHER = 2.0, 3.0
 ALIKE = 0.5  # of costs: one minimum

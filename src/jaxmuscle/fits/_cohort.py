@@ -25,10 +25,9 @@ from jaxmuscle.spectra._bin_law import trial_samples
 from jaxmuscle.spectra._fluctuations import BANDS
 
 from ._differences import Difference, difference
-from ._ladder import options_for
-from ._part import Estimate
+from ._model_choice import options_for
 from ._perturbed import aimed
-from ._result import FitResult
+from ._result import Estimate, FitResult
 from ._search import search_together
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import scipy
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._measure import Measure
 
-from ._part import Estimate
+from ._result import Estimate
 
 Number = Estimate | Measure
 CONFIDENCE = 0.95

@@ -16,7 +16,7 @@ from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import Plan, at_mean, planned
 from jaxmuscle.objective._options import DT, FitOptions, SimulationOptions
 
-from ._ladder import Models, first_rung, options_for
+from ._model_choice import Models, first_rung, options_for
 from ._perturbed import ANEW, alike, analysed, recordings_of, seen_with, without_rhythm
 from ._result import FitResult
 from ._search import search

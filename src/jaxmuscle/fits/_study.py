@@ -36,7 +36,7 @@ from jaxmuscle.objective._derived import DERIVED
 
 from ._cohort import CohortResult, fit_cohort
 from ._differences import CORRECTIONS, Difference, Number, change, corrected, difference, paired
-from ._part import ALIASES, estimates_to_table
+from ._result import ALIASES, estimates_to_table
 
 if TYPE_CHECKING:
     import pandas

@@ -14,7 +14,6 @@ from scipy.special import gammaincinv, ndtr
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import probability
-from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import Consequences, Expansion, consequences
 from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
 from jaxmuscle.objective._problem import FitProblem
@@ -22,10 +21,9 @@ from jaxmuscle.objective._residuals import PartResiduals, Residuals, further_res
 from jaxmuscle.response._expected import Moments
 
 from ._checks import Stage, seen_best
-from ._fit_file import ADEQUATE, Adequacy
-from ._half_power import HALF_POWER, half_power_intervals
 from ._intervals import Interval, intervals
 from ._refit import STRENGTHS, Refit, refit_of
+from ._result import ADEQUATE, Adequacy
 from ._signal_checks import SignalTest, check_signals
 
 ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
@@ -119,9 +117,8 @@ class Endpoint:
     def intervals(self, names: list[str]) -> dict[str, Interval]:
         """95 % intervals of these quantities; computed once."""
         new = {name: self.widening for name in names if name not in self._ends}
-        bent = {name: new.pop(name) for name in list(new) if base_of(name) == HALF_POWER}
         where = self.problem, self.objective, self.seen, self.covariance
-        self._ends.update(intervals(*where, new) | half_power_intervals(*where, bent))
+        self._ends.update(intervals(*where, new))
         return {n: self._ends[n] for n in names if n in self._ends}
 
 
