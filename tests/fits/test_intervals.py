@@ -2,6 +2,7 @@
 shelf."""
 
 import equinox as eqx
+import golden
 import jax
 import numpy as np
 import pytest
@@ -20,7 +21,6 @@ from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._linearised import linearise
 from jaxmuscle.response._transfer import half_power_frequency, half_power_level
-from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
 
 NAME, FREE = "half_power_frequency", ("c_w", "c_z")
@@ -53,11 +53,8 @@ def test_an_interval_that_says_next_to_nothing_is_none():
 
 def drawn(task, segments, seed):
     """A spectrum that scatters about that of a task by the law of its bins."""
-    power = np.asarray(expected_moments(as_arrays(task), task.settings, WINDOW)[0].proportional)
-    law = bin_statistics(jm.Target("x", power, segments=[segments]))
-    normal = np.random.default_rng(seed).multivariate_normal(np.zeros(30), law.correlation)
-    made = power * scipy.stats.gamma.ppf(scipy.stats.norm.cdf(normal), law.half) / law.half
-    return jm.Target(f"drawn {seed}", made, segments=[segments])
+    moments, _ = expected_moments(as_arrays(task), task.settings, WINDOW)
+    return golden.drawn(np.asarray(moments.proportional), segments, seed)
 
 
 def fitted(task, target, start=(0.0, 0.0)):
@@ -167,6 +164,11 @@ def test_an_interval_ends_where_the_profile_does(task, segments, x64):
     found = intervals(
         problem, objective, seen, inverse_curvature(objective, seen), dict.fromkeys(names, 1.0)
     )
+    # the same number, as a parameter and as what follows from it
+    own = intervals(
+        problem, objective, seen, inverse_curvature(objective, seen), {"c_w": 1.0, "C_w0": 1.0}
+    )
+    np.testing.assert_allclose(own["c_w"], own["C_w0"], rtol=1e-6)
     for name in names:
         ends = found[name].about(value[name])
         assert ends[0] < value[name] < ends[1]

@@ -1,5 +1,6 @@
-"""What is checked about a fit: nonlinear against linear, other minima, transients; and what is said
-about it."""
+"""What looks wrong about a fit, in sentences: other minima, a nonlinear response, numbers that no
+muscle has. `_report.py` asks for it; `controlled_moments` and `seen_best` serve the search, too.
+"""
 
 import dataclasses
 from collections import Counter

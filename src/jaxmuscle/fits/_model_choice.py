@@ -1,4 +1,7 @@
-"""The ladder: richer models, one after the other, until one describes the data."""
+"""Which model is fitted: the one that the peaks ask for, then richer ones until one describes the
+data (`climb`, for `_search.py`); and whether the harmonic and the rhythms of the chosen one are
+there (for `_report.py`).
+"""
 
 import dataclasses
 import math
@@ -37,7 +40,7 @@ from jaxmuscle.spectra._peak_test import find_peaks
 from ._checks import Stage, seen_best
 from ._refit import lines_of, over_band, without_fitted
 from ._result import ADEQUATE, Estimate, Rung
-from ._verdict import Endpoint, drawn_log_residuals, generator_of, rows_of
+from ._verdict import Endpoint, drawn_log_residuals, generator_of
 
 NEAR = 0.25  # in the logarithm: what lies at a peak
 CORNER = "corner_frequency"
@@ -407,7 +410,7 @@ def criterion(ended: Endpoint) -> tuple[float, float]:
     )
     height = 0.0
     for part, moments, rows in zip(
-        ended.problem.parts, ended.seen.moments, rows_of(ended), strict=True
+        ended.problem.parts, ended.seen.moments, ended.objective.rows, strict=True
     ):
         residuals = found.residuals[rows]
         if part.target.segments is None:

@@ -1,5 +1,6 @@
-"""From where a fit ended to its result: success in words, fresh spectrum, standard errors, what is
-undetermined."""
+"""From where a fit ended to its result: success, fresh spectrum, tables of numbers with their
+errors, what is undetermined. `_search.py` calls it when a search has ended.
+"""
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
@@ -303,7 +304,7 @@ def report_fit(
     try:
         made = [
             (
-                _simulated(problem, part, task, plan.check_seeds)
+                _simulated(problem, part, task, moments, plan.check_seeds)
                 if plan.check_seeds
                 else _expected_only(moments)
             )
@@ -312,16 +313,6 @@ def report_fit(
     except (SimulationError, ValueError) as error:
         return _failed(problem, common, f"the fitted task cannot be simulated: {error}")
     found = ended.found
-    made = [
-        m._replace(
-            each=m.each._replace(
-                line=np.tile(
-                    np.minimum(x.line, np.mean(m.each.power, axis=0)), (len(m.each.mean), 1)
-                )
-            )
-        )
-        for m, x in zip(made, seen.moments, strict=True)
-    ]
     judgement, covariance = ended.adequacy, ended.covariance
     known = Identifiability.of_covariance(covariance)
     success, message = convergence(
@@ -349,7 +340,7 @@ def report_fit(
     ]
     parameters = parameter_table(problem, tasks, covariance, known)
     derived = merged(problem, tables, found.slopes)
-    c = problem.coordinates
+    names = problem.coordinates.names
     other, moved = rivals(
         problem, stages[0] if problem.method == "linear" else stages[-1], parameters | derived
     )
@@ -363,11 +354,7 @@ def report_fit(
         widened(without_errors(moved, table), ended.widening) for table in (parameters, derived)
     )
     ends = ended.intervals(
-        [
-            n
-            for n, p in (parameters | derived).items()
-            if p.stderr and (n in derived or n in c.names)
-        ]
+        [n for n, p in (parameters | derived).items() if p.stderr and n in {*derived, *names}]
     )
     parameters, derived = (with_intervals(table, ends) for table in (parameters, derived))
     polish = polish_check(problem, stages, derived)
@@ -389,8 +376,8 @@ def report_fit(
         parts=parts,
         parameters=parameters,
         derived=derived,
-        correlation=correlation_table(problem.coordinates.names, covariance),
-        undetermined=common_scales(problem.coordinates.names, known),
+        correlation=correlation_table(names, covariance),
+        undetermined=common_scales(names, known),
         singular_values=known.singular_values,
         profile=None if line_test is None else (line_test.frequency, line_test.rise),
         harmonic_p_value=None if line_test is None else line_test.p_value,
@@ -426,13 +413,18 @@ class _Made(NamedTuple):
     stretch: tuple[np.ndarray, np.ndarray]
 
 
-def _simulated(problem: FitProblem, part: Part, task: AbstractTask, seeds: int) -> _Made:
-    """Of fresh seeds of the nonlinear model."""
+def _simulated(
+    problem: FitProblem, part: Part, task: AbstractTask, moments: Moments, seeds: int
+) -> _Made:
+    """Of fresh seeds of the nonlinear model; the line as in linear response, as far as there is so
+    much power."""
     still = settled(task) if problem.control else task
     key = fold_in(problem.key, 1)
     runs = runs_for_means(still, key, seeds)
     each, expected = controlled_moments(runs, part.target, task)
-    each = each._replace(power=np.asarray(each.power)[:, part.chosen])
+    power = np.asarray(each.power)[:, part.chosen]
+    line = np.tile(np.minimum(moments.line, np.mean(power, axis=0)), (len(power), 1))
+    each = each._replace(power=power, line=line)
     start = round((runs.time[-1] - STRETCH) * runs.rate)
     stretch = runs.time[start:], np.asarray(runs.output[0])[start:]
     return _Made(

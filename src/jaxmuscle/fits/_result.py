@@ -1,5 +1,6 @@
-"""The result of a fit, of one target or of several: what was found, how sure it is, and what it
-cannot say."""
+"""The result of a fit, of one target or of several, and its file: what was found, how sure it is,
+and what it cannot say. `_report.py` makes it; all that reads fits takes it from here.
+"""
 
 import math
 import os
@@ -14,11 +15,11 @@ from jaxtyping import Complex, Float
 from msgspec import Meta
 
 from jaxmuscle import plot
-from jaxmuscle._common.arrays import from_nulls, with_nulls
+from jaxmuscle._common.arrays import from_nulls
 from jaxmuscle._common.cards import Card, Result, Shown, reports
 from jaxmuscle._common.documents import Table, checked, converted, parsed, says
 from jaxmuscle._common.errors import ResultError
-from jaxmuscle._common.files import expanded, write_json
+from jaxmuscle._common.files import expanded, nulled, write_json
 from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.keys import SEEDS
 from jaxmuscle._common.parts import of_only, only
@@ -340,6 +341,8 @@ RELATIVE = {
 }
 ALIASES = {"activation_time": "contraction_time"}
 SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
+STRETCH = ("time", "output")
+SAME_OF_PART = ("chi2_per_bin", "rms_log_error", "check", "further")
 
 
 class Estimate(Shown, eqx.Module):
@@ -568,34 +571,14 @@ def _over(p: Estimate, mean: float) -> Estimate:
     )
 
 
-def estimates_to_table(table: dict[str, Estimate]) -> dict[str, Any]:
-    """For JSON, which knows no infinite numbers."""
-    return {
-        n: {
-            "value": with_nulls(float(p.value)),
-            "unit": p.unit,
-            "stderr": p.stderr,
-            "free": p.free,
-            "identifiable": p.identifiable,
-            "interval": None if p.interval is None else list(p.interval),
-        }
-        for n, p in table.items()
-    }
-
-
 def read_estimates(table: dict[str, EstimateTable]) -> dict[str, Estimate]:
-    """The reverse of `estimates_to_table`."""
-    return {
-        n: Estimate(
-            np.nan if p.value is None else p.value,
-            p.unit,
-            p.stderr,
-            p.free,
-            p.identifiable,
-            p.interval,
-        )
-        for n, p in table.items()
-    }
+    """Of a file, which has null where there is no value."""
+    found = {}
+    for name, entry in table.items():
+        given: dict[str, Any] = msgspec.structs.asdict(entry)
+        given["value"] = math.nan if entry.value is None else entry.value
+        found[name] = Estimate(**given)
+    return found
 
 
 def part_to_table(part: FittedPart) -> dict[str, Any]:
@@ -608,21 +591,16 @@ def part_to_table(part: FittedPart) -> dict[str, Any]:
         "target": part.target.name,
         "provenance": part.target.provenance,
         "task": kind,
-        "chi2_per_bin": part.chi2_per_bin,
-        "rms_log_error": part.rms_log_error,
+        **{name: getattr(part, name) for name in SAME_OF_PART},
         "spectrum": {
-            "frequency_hz": with_nulls(part.frequency_hz),
-            "target": with_nulls(part.target.proportional_power),
-            **{field: with_nulls(getattr(part, field)) for field in SPECTRUM},
-            "components": {name: with_nulls(share) for name, share in part.components.items()},
+            "frequency_hz": part.frequency_hz,
+            "target": part.target.proportional_power,
+            **{field: getattr(part, field) for field in SPECTRUM},
+            "components": part.components,
         },
-        "stretch": {"time": with_nulls(part.stretch[0]), "output": with_nulls(part.stretch[1])},
-        "check": part.check,
-        "further": part.further,
+        "stretch": dict(zip(STRETCH, part.stretch, strict=True)),
         "stiffness": (
-            None
-            if part.stiffness is None
-            else [np.real(part.stiffness).tolist(), np.imag(part.stiffness).tolist()]
+            None if part.stiffness is None else [np.real(part.stiffness), np.imag(part.stiffness)]
         ),
         "target_table": part.target.to_table(whole=True),
         "task_table": task_to_table(part.task),
@@ -631,23 +609,17 @@ def part_to_table(part: FittedPart) -> dict[str, Any]:
 
 def read_part(table: PartTable) -> FittedPart:
     """The reverse of `part_to_table`."""
-    spectrum, stretch, stiffness = table.spectrum, table.stretch, table.stiffness
-    target = Target.from_table(table.target_table, whole=True)
+    spectrum, stiffness = table.spectrum, table.stiffness
     return FittedPart(
-        target=target,
+        **{name: getattr(table, name) for name in SAME_OF_PART},
+        target=Target.from_table(table.target_table, whole=True),
         task=task_from_table(table.task_table, whole=True),
-        chi2_per_bin=table.chi2_per_bin,
-        rms_log_error=table.rms_log_error,
         **{field: from_nulls(getattr(spectrum, field)) for field in SPECTRUM},
-        components={
-            name: np.asarray(from_nulls(share)) for name, share in spectrum.components.items()
-        },
-        stretch=(from_nulls(stretch.time), from_nulls(stretch.output)),
-        check=table.check,
-        further=table.further,
-        stiffness=(
-            None if stiffness is None else np.array(stiffness[0]) + 1j * np.array(stiffness[1])
-        ),
+        components={name: from_nulls(share) for name, share in spectrum.components.items()},
+        stretch=(from_nulls(table.stretch.time), from_nulls(table.stretch.output)),
+        stiffness=None
+        if stiffness is None
+        else np.array(stiffness[0]) + 1j * np.array(stiffness[1]),
     )
 
 
@@ -659,6 +631,20 @@ WHAT_TO_DO = (
     " all fits so far"
 )
 PROFILE = ("frequency_hz", "chi2_rise")
+# what a result and its file have alike
+SAME = (
+    "success",
+    "message",
+    "method",
+    "adequacy",
+    "ladder",
+    "starts",
+    "undetermined",
+    "harmonic_p_value",
+    "notices",
+    "seed",
+    "versions",
+)
 PRIOR = ("prior_centre", "prior_sd")
 
 
@@ -938,33 +924,23 @@ def to_table(result: FitResult) -> dict[str, Any]:
     parts = {name: part_to_table(part) for name, part in result.parts.items()}
     own = next(iter(parts.values())) if len(parts) == 1 else {"parts": parts}
     profile = result.profile
-    return {
-        "format": FORMAT,
-        "success": result.success,
-        "message": result.message,
-        "adequate": result.adequate,
-        "adequacy_p": result.adequacy_p,
-        "adequacy": msgspec.to_builtins(result.adequacy),
-        "verdict": result.verdict,
-        **own,
-        "method": result.method,
-        "parameters": estimates_to_table(result.parameters),
-        "derived": estimates_to_table(result.derived),
-        "per_newton": {name: with_nulls(value) for name, value in result.per_newton.items()},
-        "correlation": result.correlation,
-        "undetermined": list(result.undetermined),
-        "ladder": msgspec.to_builtins(list(result.ladder)),
-        "singular_values": with_nulls(result.singular_values),
-        "starts": msgspec.to_builtins(list(result.starts)),
-        "profile": (
-            None if profile is None else dict(zip(PROFILE, map(with_nulls, profile), strict=True))
-        ),
-        "harmonic_p_value": result.harmonic_p_value,
-        "notices": list(result.notices),
-        "seed": result.seed,
-        "settings": result.settings,
-        "versions": result.versions,
-    }
+    return nulled(
+        {
+            "format": FORMAT,
+            **{name: msgspec.to_builtins(getattr(result, name)) for name in SAME},
+            "adequate": result.adequate,
+            "adequacy_p": result.adequacy_p,
+            "verdict": result.verdict,
+            **own,
+            "parameters": {name: vars(p) for name, p in result.parameters.items()},
+            "derived": {name: vars(p) for name, p in result.derived.items()},
+            "per_newton": result.per_newton,
+            "correlation": result.correlation,
+            "singular_values": result.singular_values,
+            "profile": None if profile is None else dict(zip(PROFILE, profile, strict=True)),
+            "settings": result.settings,
+        }
+    )
 
 
 def load_result(path: str | Path) -> FitResult:
@@ -1017,28 +993,18 @@ def _from_table(table: dict[str, Any], file: str) -> FitResult:
     if several and len(read) < 2:
         raise ResultError(f"{file}: parts holds {len(read)} targets, where several belong")
     return FitResult(
-        success=said.success,
-        message=said.message,
-        adequacy=said.adequacy,
+        **{name: getattr(said, name) for name in SAME},
         parts=read if several else {part.target.name: part for part in read.values()},
-        method=said.method,
         parameters=read_estimates(said.parameters),
         derived=read_estimates(said.derived),
         correlation=table["correlation"],
-        undetermined=said.undetermined,
-        ladder=said.ladder,
         singular_values=from_nulls(said.singular_values),
-        starts=said.starts,
         profile=(
             None
             if said.profile is None
             else tuple(from_nulls(getattr(said.profile, name)) for name in PROFILE)
         ),
-        harmonic_p_value=said.harmonic_p_value,
-        notices=said.notices,
-        seed=said.seed,
         settings=table["settings"],
-        versions=said.versions,
     )
 
 

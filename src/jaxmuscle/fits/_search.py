@@ -1,5 +1,6 @@
 """The search of a fit: many starts, the best minima polished, whatever was reached when
-interrupted."""
+interrupted. `_fit.py` and `_joint.py` call `search`, cohorts and bootstraps `search_together`.
+"""
 
 import dataclasses
 import functools
