@@ -16,7 +16,7 @@ import scipy.signal
 import scipy.stats
 
 import jaxmuscle as jm
-from jaxmuscle.fits._harmonic_evidence import harmonic_test
+from jaxmuscle.fits._model_choice import harmonic_test
 from jaxmuscle.fits._search import _together
 from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import expand, quantities

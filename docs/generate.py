@@ -12,7 +12,7 @@ import msgspec
 from jaxmuscle.data._frequency_response import ResponseTable
 from jaxmuscle.data._study_table import ReadingTable, RecordingTable, StudyFile
 from jaxmuscle.data._target_fields import TargetFile
-from jaxmuscle.fits import _fit_file
+from jaxmuscle.fits import _result
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS, Parameter
 from jaxmuscle.response._presets import PresetFile
 
@@ -131,7 +131,7 @@ two ways:
 
 At its top a study.toml may have the keys of the second and the third table. What it says there about reading holds for every
 recording that does not say it itself."""
-F = _fit_file
+F = _result
 SECTIONS = (
     (
         "fit.json",

@@ -90,7 +90,7 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "fits/_search",
             "objective/_covariance",
             "fits/_checks",
-            "fits/_harmonic_evidence",
+            "fits/_model_choice",
         ),
         ("uncertainty", "checks", "fit", "identify", "joint", "fitting", "goodness"),
     ),

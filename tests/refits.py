@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from jaxmuscle.fits._adequacy import Endpoint
+from jaxmuscle.fits._verdict import Endpoint
 
 
 @contextlib.contextmanager

@@ -17,9 +17,8 @@ import jaxmuscle as jm
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle.checks import _bootstrap
 from jaxmuscle.checks import _replicates as _bootstrap_data
-from jaxmuscle.checks._goodness import numbers_of, p_values, residuals_of
-from jaxmuscle.checks._recovery import Recovery
-from jaxmuscle.checks._refits import Drawn, refitted
+from jaxmuscle.checks._bootstrap import Recovery
+from jaxmuscle.checks._goodness import Drawn, numbers_of, p_values, refitted, residuals_of
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._search import search_together

@@ -1,51 +1,30 @@
 """The verdict: whether the model describes the data, and what is withheld where it does not."""
 
 import functools
-from typing import Any
 
 import jax
 import numpy as np
 import pytest
 import scipy.stats
+from golden import QUICK, TASK, drawn, expected, missed_fit, plain_fit
 from refits import without_intervals
 
 import jaxmuscle as jm
-from jaxmuscle.fits._adequacy import Endpoint, _misfit, elsewhere
-from jaxmuscle.fits._intervals import intervals
 from jaxmuscle.fits._refit import without_fitted
+from jaxmuscle.fits._verdict import Endpoint, _misfit, elsewhere
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import consequences, expand, quantities
 from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.response._rows import line_levels
-from jaxmuscle.spectra._bin_law import bin_statistics
 
-TASK = jm.Isometric()
 SETTINGS = TASK.settings
-QUICK: dict[str, Any] = {"starts": 8, "seeds": 0, "check_seeds": 0}
 
 
 @functools.cache
 def own_power() -> np.ndarray:
     """Proportional power of the default muscle."""
-    with jax.enable_x64(True):
-        return np.asarray(jm.expected_spectrum(TASK).proportional)
-
-
-def drawn(segments: int, seed: int, power: np.ndarray | None = None) -> jm.Target:
-    """A spectrum that scatters about a power by the law of its bins."""
-    power = own_power() if power is None else power
-    law = bin_statistics(jm.Target("x", power, segments=[segments]))
-    normal = np.random.default_rng(seed).multivariate_normal(np.zeros(30), law.correlation)
-    made = power * scipy.stats.gamma.ppf(scipy.stats.norm.cdf(normal), law.half) / law.half
-    return jm.Target(f"drawn {segments} {seed}", made, segments=[segments])
-
-
-def with_band(share: float, frequency: float = 9.0, width: float = 2.0) -> np.ndarray:
-    """The muscle's spectrum with a band of tremor that holds a share of the power."""
-    f, power = SETTINGS.frequency, own_power()
-    band = width**2 * f**2 / ((frequency**2 - f**2) ** 2 + width**2 * f**2)
-    return (1 - share) * power + share * band / band.sum()
+    return expected(TASK)
 
 
 # --- chi² and its distribution
@@ -107,7 +86,7 @@ def test_p_is_uniform_about_the_models_own_spectra():
     """Of few and of many segments; benchmarks/verdict.py has 500 of each and of 12, docs/fitting.md
     what came out."""
     count = 12
-    made = [drawn(segments, seed) for segments in (3, 60) for seed in range(count)]
+    made = [drawn(own_power(), segments, seed) for segments in (3, 60) for seed in range(count)]
     with without_intervals():
         results = jm.fit_cohort(made, starts=8).results.values()
     p = np.array([result.adequacy_p for result in results]).reshape(2, count)
@@ -123,15 +102,10 @@ def test_p_is_uniform_about_the_models_own_spectra():
 # --- a fit that misses the data
 
 
-@functools.cache
-def missed() -> jm.fits.FitResult:
-    return jm.fit(TASK, drawn(60, 3, with_band(0.1)), rungs=0, **QUICK)
-
-
 def test_a_band_of_tremor_is_found_and_named():
     """A line of zero width is no tremor: ten percent of the power at 9 Hz, 2 Hz wide, in 60
     segments."""
-    result = missed()
+    result = missed_fit()
     assert result.success and result.adequate is False and result.adequacy_p <= 0.002
     assert result.verdict.startswith("does not describe the data: chi2 per bin ")
     words = result.adequacy.misfit.split()
@@ -143,7 +117,7 @@ def test_a_band_of_tremor_is_found_and_named():
 def test_a_single_bin_beside_the_run_is_named_with_its_own_sign(x64):
     """Five bins each three standard deviations above, one below: whether that one is said depends
     on its size alone."""
-    frequency, plan = SETTINGS.frequency, planned(TASK, drawn(60, 3), FitOptions())
+    frequency, plan = SETTINGS.frequency, planned(TASK, drawn(own_power(), 60, 3), FitOptions())
     objective, run = plan.problem.linear(), slice(18, 23)
 
     def words(alone: float) -> str:
@@ -162,7 +136,7 @@ def test_a_single_bin_beside_the_run_is_named_with_its_own_sign(x64):
 
 def test_a_run_has_no_bin_that_is_clearly_off_the_other_way(x64):
     """The figure shows two hills with a dip between them, or one hill with a small one."""
-    frequency, plan = SETTINGS.frequency, planned(TASK, drawn(60, 3), FitOptions())
+    frequency, plan = SETTINGS.frequency, planned(TASK, drawn(own_power(), 60, 3), FitOptions())
     objective = plan.problem.linear()
 
     def words(between: float) -> str:
@@ -179,7 +153,7 @@ def test_a_run_has_no_bin_that_is_clearly_off_the_other_way(x64):
 
 
 def test_errors_of_such_a_fit_are_widened_and_its_harmonic_is_not_judged():
-    result = missed()
+    result = missed_fit()
     factor = result.adequacy.widening
     assert (
         factor == pytest.approx(np.sqrt(result.adequacy.chi2 / result.adequacy.expected))
@@ -205,8 +179,12 @@ def test_errors_of_such_a_fit_are_widened_and_its_harmonic_is_not_judged():
 def test_what_was_measured_is_as_certain_as_its_measurement():
     """That the spectrum is missed widens the errors of the model's numbers, also of a mean that was
     given to the fit, but of nothing that is measured."""
-    given, error = missed().derived["model_mean"].value, 0.02
-    rows = missed().target.to_table() | {"mean": [2.0, 2.1, 2.3], "unit": "N", "segments": [20] * 3}
+    given, error = missed_fit().derived["model_mean"].value, 0.02
+    rows = missed_fit().target.to_table() | {
+        "mean": [2.0, 2.1, 2.3],
+        "unit": "N",
+        "segments": [20] * 3,
+    }
     target = jm.Target.from_table({key: value for key, value in rows.items() if key != "measured"})
     result = jm.fit(TASK, target, mean_force=(given, error), rungs=0, **QUICK)
     assert result.adequate is False and result.adequacy.widening > 1.3
@@ -221,7 +199,7 @@ def test_what_was_measured_is_as_certain_as_its_measurement():
 
 def test_a_good_fit_is_called_so():
     """The same spectrum without the band: one in a hundred would be missed, this one is not."""
-    result = jm.fit(TASK, drawn(60, 3), **QUICK)
+    result = jm.fit(TASK, drawn(own_power(), 60, 3), **QUICK)
     assert result.adequate is True and result.advice == () and result.adequacy.widening == 1.0
     assert result.verdict.startswith("describes the data: ")
 
@@ -243,7 +221,7 @@ def test_a_faint_harmonic_has_no_errors_and_a_strong_one_has(x64):
     for amplitude in (0.003, 0.05):
         task = TASK.replace(harmonic_amplitude=amplitude, harmonic_frequency=4.3)
         power = np.asarray(jm.expected_spectrum(task).proportional)
-        plan = planned(TASK, drawn(30, 5, power), FitOptions())
+        plan = planned(TASK, drawn(power, 30, 5), FitOptions())
         problem = plan.problem
         theta = problem.theta_of((task,))
         objective = problem.linear()
@@ -253,44 +231,11 @@ def test_a_faint_harmonic_has_no_errors_and_a_strong_one_has(x64):
     assert shares[0.003] > 0.5 and shares[0.05] < 1e-3
 
 
-def test_an_interval_ends_where_the_profile_says(x64):
-    """Against scipy's constrained minimum of the same cost, for the noise that one target and two
-    parameters allow."""
-    from scipy.optimize import minimize_scalar
-
-    free = ("c_w", "noise_K_z")
-    problem = planned(TASK, drawn(12, 4), FitOptions(free=free)).problem
-    objective = problem.linear()
-
-    def cost(theta: np.ndarray) -> float:
-        found = consequences(objective, expand(objective, theta[None]).row(0))
-        return float(np.sum(found.residuals**2) + np.sum(theta**2))
-
-    theta = np.zeros(2)
-    for _ in range(12):
-        found = consequences(objective, expand(objective, theta[None]).row(0))
-        J = found.jacobian
-        theta = theta - np.linalg.solve(J.T @ J + np.eye(2), J.T @ found.residuals + theta)
-    seen = expand(objective, theta[None]).row(0)
-    found = consequences(objective, seen)
-    gain = np.linalg.inv(found.jacobian.T @ found.jacobian + np.eye(2))
-    # With the inverse curvature as covariance the rise that is sought is 1.96².
-    ends = intervals(problem, objective, seen, gain, {"c_w": 1.0})["c_w"]
-    for end in (ends.low, ends.high):
-        assert end is not None
-        held = theta[0] + end
-        rest = minimize_scalar(
-            lambda b, held=held: cost(np.array([held, b])), bracket=(theta[1] - 0.3, theta[1] + 0.3)
-        )
-        assert rest.fun - cost(theta) == pytest.approx(1.96**2, rel=0.05)
-    assert ends.about(2.0)[1] == pytest.approx(2.0 * np.exp(ends.high))
-
-
 def test_one_criterion_for_a_parameter_and_for_what_is_the_same_number():
     """C_w0 = c_w v_ref²: with the rest known both have an error, of the same size in percent; else
     neither."""
     known = {n: float(TASK[n]) for n in DEFAULT_FREE if n != "c_w"}
-    result = jm.fit(TASK, drawn(30, 6), fix=known, **QUICK)
+    result = jm.fit(TASK, drawn(own_power(), 30, 6), fix=known, **QUICK)
     a, b = result.parameters["c_w"], result.derived["C_w0"]
     assert a.stderr is not None and b.stderr is not None
     assert a.stderr / a.value == pytest.approx(b.stderr / b.value)
@@ -298,7 +243,7 @@ def test_one_criterion_for_a_parameter_and_for_what_is_the_same_number():
         result.parameters["k_w"].identifiable is None
         and result.derived["K_w0"].identifiable is None
     )
-    full = jm.fit(TASK, drawn(30, 6), **QUICK)
+    full = jm.fit(TASK, drawn(own_power(), 30, 6), **QUICK)
     assert full.parameters["c_w"].stderr is None and full.derived["C_w0"].stderr is None
 
 
@@ -309,12 +254,12 @@ def test_a_mean_force_that_nothing_can_reach_is_refused():
     with pytest.raises(
         ValueError, match=r"mean_force = 120 N cannot be reached.*P_w = 5 N.*task\.at_force\(120\)"
     ):
-        jm.fit(TASK, drawn(12, 1), mean_force=(120.0, 3.0))
+        jm.fit(TASK, drawn(own_power(), 12, 1), mean_force=(120.0, 3.0))
 
 
 def test_a_mean_force_in_newtons_is_met_by_the_carried_muscle():
     task = TASK.at_force(120.0)
-    result = jm.fit(task, drawn(12, 1), mean_force=(120.0, 1.0), **QUICK)
+    result = jm.fit(task, drawn(own_power(), 12, 1), mean_force=(120.0, 1.0), **QUICK)
     assert result.adequate and result.derived["model_mean"].value == pytest.approx(120.0, abs=2.0)
     assert abs(result.only.further["mean"]) < 2 and result.per_newton == {}
 
@@ -323,7 +268,9 @@ def test_a_mean_force_that_the_spectrum_contradicts_is_said():
     """Stiffnesses held: the mean is 2.2 N whatever the noise, 20 stated errors from what is
     asked."""
     held = {n: float(TASK[n]) for n in ("k_w", "k_z")}
-    result = jm.fit(TASK, drawn(12, 1), fix=held, mean_force=(3.0, 0.04), rungs=0, **QUICK)
+    result = jm.fit(
+        TASK, drawn(own_power(), 12, 1), fix=held, mean_force=(3.0, 0.04), rungs=0, **QUICK
+    )
     assert abs(result.only.further["mean"]) > 3
     assert any("standard deviations below the given one" in notice for notice in result.notices)
 
@@ -334,7 +281,7 @@ def test_the_active_force_may_be_free_with_a_prior_in_ratio():
     held = {n: float(TASK[n]) for n in ("k_w", "k_z")}
     result = jm.fit(
         TASK,
-        drawn(12, 1),
+        drawn(own_power(), 12, 1),
         free=("P_w", "noise_K_w", "noise_K_z", "c_w"),
         mean_force=(4.0, 0.02),
         **QUICK,
@@ -349,7 +296,7 @@ def test_the_active_force_may_be_free_with_a_prior_in_ratio():
 
 
 def test_quantities_that_are_observed_are_those_of_the_fit():
-    result = jm.fit(TASK, drawn(12, 2), **QUICK)
+    result = plain_fit()
     with jax.enable_x64(True):
         problem = planned(TASK, result.target, FitOptions()).problem
         objective = problem.linear()
@@ -364,7 +311,7 @@ def test_quantities_that_are_observed_are_those_of_the_fit():
 
 
 def test_the_power_in_bands_has_intervals():
-    result = jm.fit(TASK, drawn(12, 2), **QUICK)
+    result = plain_fit()
     bands = [p for name, p in result.derived.items() if name.startswith("band_")]
     assert len(bands) == 6 and sum(p.stderr is not None for p in bands) >= 3
     assert all((p.interval is None) == (p.stderr is None) for p in bands)

@@ -6,7 +6,7 @@ import pytest
 import scipy.stats
 
 from jaxmuscle.fits._checks import convergence, linear_check
-from jaxmuscle.fits._fit_file import Start
+from jaxmuscle.fits._result import Start
 from jaxmuscle.objective._covariance import Identifiability
 from jaxmuscle.objective._least_squares import Minima
 from jaxmuscle.spectra._bin_law import BinStatistics

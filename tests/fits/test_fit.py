@@ -215,11 +215,6 @@ def compiled_values():
     return jax.jit(lambda s: given.values(given.theta(s)))
 
 
-def test_the_origin_is_the_task_itself(x64):
-    values = coordinates().values(jnp.zeros(len(NATURAL)))
-    np.testing.assert_allclose([values[n] for n in NATURAL], list(NATURAL.values()), rtol=1e-15)
-
-
 def test_theta_counts_standard_deviations_of_the_prior(x64):
     values = coordinates().values(jnp.full(len(NATURAL), 0.5))
     for name, value in NATURAL.items():

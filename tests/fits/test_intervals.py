@@ -2,6 +2,7 @@
 shelf."""
 
 import equinox as eqx
+import golden
 import jax
 import numpy as np
 import pytest
@@ -10,10 +11,9 @@ from scipy.interpolate import RectBivariateSpline
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.fits._half_power import half_power_intervals
 from jaxmuscle.fits._intervals import Interval, intervals
-from jaxmuscle.fits._part import Estimate
-from jaxmuscle.fits._tables import with_intervals
+from jaxmuscle.fits._report import with_intervals
+from jaxmuscle.fits._result import Estimate
 from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import consequences, consequences_of_rows, expand
 from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
@@ -21,7 +21,6 @@ from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._linearised import linearise
 from jaxmuscle.response._transfer import half_power_frequency, half_power_level
-from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
 
 NAME, FREE = "half_power_frequency", ("c_w", "c_z")
@@ -54,11 +53,8 @@ def test_an_interval_that_says_next_to_nothing_is_none():
 
 def drawn(task, segments, seed):
     """A spectrum that scatters about that of a task by the law of its bins."""
-    power = np.asarray(expected_moments(as_arrays(task), task.settings, WINDOW)[0].proportional)
-    law = bin_statistics(jm.Target("x", power, segments=[segments]))
-    normal = np.random.default_rng(seed).multivariate_normal(np.zeros(30), law.correlation)
-    made = power * scipy.stats.gamma.ppf(scipy.stats.norm.cdf(normal), law.half) / law.half
-    return jm.Target(f"drawn {seed}", made, segments=[segments])
+    moments, _ = expected_moments(as_arrays(task), task.settings, WINDOW)
+    return golden.drawn(np.asarray(moments.proportional), segments, seed)
 
 
 def fitted(task, target, start=(0.0, 0.0)):
@@ -168,6 +164,11 @@ def test_an_interval_ends_where_the_profile_does(task, segments, x64):
     found = intervals(
         problem, objective, seen, inverse_curvature(objective, seen), dict.fromkeys(names, 1.0)
     )
+    # the same number, as a parameter and as what follows from it
+    own = intervals(
+        problem, objective, seen, inverse_curvature(objective, seen), {"c_w": 1.0, "C_w0": 1.0}
+    )
+    np.testing.assert_allclose(own["c_w"], own["C_w0"], rtol=1e-6)
     for name in names:
         ends = found[name].about(value[name])
         assert ends[0] < value[name] < ends[1]
@@ -198,7 +199,7 @@ def test_that_of_a_half_power_frequency_ends_where_its_profile_does(task, x64):
     either end."""
     problem, objective, seen = fitted(task, drawn(task, 45, 3))
     value, gain = consequences(objective, seen).values[0][NAME], inverse_curvature(objective, seen)
-    low, high = half_power_intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value)
+    low, high = intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value)
     assert low < value < high
     rises = rise(objective, seen, seen.theta + PLANE)
     np.testing.assert_allclose(
@@ -217,7 +218,7 @@ def test_about_a_shelf_there_is_no_interval(x64):
         max(lowest(level(SHELF, theta, f), rises) for f in np.geomspace(value, 2 * LAST, 8)[1:])
         < 1.96
     )
-    assert half_power_intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value) == (
+    assert intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value) == (
         None,
         None,
     )
@@ -237,9 +238,7 @@ def test_stated_intervals_hold_the_truth(x64):
         scatter = residual_covariance(problem.parts[0].target, objective.parts[0], np.zeros(30))
         covariance = parameter_covariance(found.jacobian, scatter, problem.precision)
         value = float(found.values[0][NAME])
-        low, high = half_power_intervals(problem, objective, seen, covariance, {NAME: 1.0})[
-            NAME
-        ].about(value)
+        low, high = intervals(problem, objective, seen, covariance, {NAME: 1.0})[NAME].about(value)
         if low is not None:
             held.append(low <= frequency_of(truth) <= high)
     assert len(held) >= 15 and len(held) - sum(held) <= scipy.stats.binom.isf(1e-4, len(held), 0.05)

@@ -36,15 +36,17 @@ def response(seed=0, segments=40):
     return jm.data.FrequencyResponse(F, true + sd * (noise[0] + 1j * noise[1]), sd, name="figure")
 
 
+def command(*arguments):
+    return CliRunner().invoke(app, ["fit", *map(str, arguments)], env={"COLUMNS": "1000"})
+
+
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """The folder that the command wrote, and what it printed."""
     folder = tmp_path_factory.mktemp("moved")
     response().save(folder / "figure.csv")
-    options = ["--rungs", "0", "--starts", "8", "--out", str(folder / "out")]
-    found = CliRunner().invoke(
-        app, ["fit", str(folder / "figure.csv"), *options], env={"COLUMNS": "1000"}
-    )
+    options = ["--rungs", "0", "--starts", "8", "--out", folder / "out"]
+    found = command(folder / "figure.csv", *options)
     assert found.exit_code == 0, found.output
     return folder / "out", found.output
 
@@ -227,9 +229,9 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
         "8",
         "--quick",
         "--out",
-        str(folder),
+        folder,
     ]
-    said = CliRunner().invoke(app, ["fit", str(path), *options], env={"COLUMNS": "1000"})
+    said = command(path, *options)
     assert said.exit_code == 0, said.output
     assert {file.name for file in folder.iterdir()} == {"fit.json", "spectrum.csv", "stiffness.csv"}
     result = jm.load_result(folder / "fit.json")
@@ -247,11 +249,7 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
     table = np.stack([np.arange(force.size) / 100, 1e3 * force], axis=1)[300:]
     # newtons all the same
     np.savetxt(hold, table, delimiter=",", header="time,force_mN", comments="", fmt="%.8g")
-    said = CliRunner().invoke(
-        app,
-        ["fit", str(path), "--hold", str(hold), *options[4:], "--force"],
-        env={"COLUMNS": "1000"},
-    )
+    said = command(path, "--hold", hold, *options[4:], "--force")
     assert said.exit_code == 0, said.output
     joint = jm.load_result(folder / "fit.json")
     assert list(joint.parts) == ["moved", "held"] and joint.parts["held"].target.name == "hold"
@@ -318,11 +316,7 @@ def test_a_hold_that_cannot_be_fitted_with_a_moved_record(tmp_path, given, messa
     files = written_records(tmp_path)
     named = ["--force-column", "force_N", "--displacement", "x_m"] if given[0] == "PULL" else []
     out = tmp_path / "out"
-    said = CliRunner().invoke(
-        app,
-        ["fit", *(files.get(x, x) for x in given), *named, "--out", str(out)],
-        env={"COLUMNS": "1000"},
-    )
+    said = command(*(files.get(x, x) for x in given), *named, "--out", out)
     assert said.exit_code == 2 and message in said.stderr, said.output
     assert not (out / "fit.json").exists()
 
@@ -356,11 +350,11 @@ def test_one_model_of_the_ladder_is_fitted_with_a_hold(tmp_path, monkeypatch):
         raise ValueError("enough")
 
     monkeypatch.setattr(jm, "fit", fake)
-    named = ["--force-column", "force_N", "--displacement", "x_m", "--out", str(tmp_path / "out")]
-    given = ["fit", files["PULL"], "--hold", files["HOLD"], *named]
+    named = ["--force-column", "force_N", "--displacement", "x_m", "--out", tmp_path / "out"]
+    given = [files["PULL"], "--hold", files["HOLD"], *named]
     for rung, rungs in (([], 3), (["--rung", "2"], 0), (["--rungs", "1"], 1)):
         seen.clear()
-        assert "enough" in CliRunner().invoke(app, [*given, *rung]).stderr
+        assert "enough" in command(*given, *rung).stderr
         assert seen["rungs"] == rungs
         assert seen["tasks"] == (
             {
@@ -380,10 +374,8 @@ def test_a_hold_is_not_taken_for_a_moved_record(tmp_path):
         header="force_N",
         comments="",
     )
-    options = ["--rate", "100", "--task", "prescribed-length", "--out", str(tmp_path / "out")]
-    said = CliRunner().invoke(
-        app, ["fit", str(tmp_path / "hold.csv"), *options], env={"COLUMNS": "1000"}
-    )
+    options = ["--rate", "100", "--task", "prescribed-length", "--out", tmp_path / "out"]
+    said = command(tmp_path / "hold.csv", *options)
     assert (
         said.exit_code == 2
         and "hold.csv: no displacement was found beside the force" in said.stderr

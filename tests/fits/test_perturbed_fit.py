@@ -15,8 +15,8 @@ from scipy.interpolate import make_interp_spline
 from scipy.optimize import brentq
 
 import jaxmuscle as jm
-from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._perturbed import alike, seen_with, without_rhythm
+from jaxmuscle.fits._verdict import Endpoint
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.uncertainty import _posterior

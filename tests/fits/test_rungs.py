@@ -1,22 +1,26 @@
 """The ladder: the model that the peaks ask for, and richer ones until one describes the data."""
 
 import functools
-from typing import Any
 
-import jax
 import numpy as np
 import pytest
-import scipy.stats
+from golden import QUICK, TASK, TREMOR, drawn, expected, tremor_fit, with_tremor
 from refits import without_intervals
 from scipy.optimize import brentq
 
 import jaxmuscle as jm
-from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._checks import mass_notices, twitch_notices
-from jaxmuscle.fits._ladder import _fewer, criterion, first_rung
-from jaxmuscle.fits._part import Estimate
-from jaxmuscle.fits._peaks import find_slower_peak, find_tremor, find_unseen
+from jaxmuscle.fits._model_choice import (
+    _fewer,
+    criterion,
+    find_slower_peak,
+    find_tremor,
+    find_unseen,
+    first_rung,
+)
 from jaxmuscle.fits._reopened import reopened
+from jaxmuscle.fits._result import Estimate
+from jaxmuscle.fits._verdict import Endpoint
 from jaxmuscle.model._rungs import QUIET, RUNGS
 from jaxmuscle.objective._arguments import DAMPING_SD, planned
 from jaxmuscle.objective._consequences import expand
@@ -25,35 +29,7 @@ from jaxmuscle.objective._derived import derived_names
 from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._linearised import linearised
-from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
-
-TASK = jm.Isometric()
-QUICK: dict[str, Any] = {"starts": 8, "seeds": 0, "check_seeds": 0}
-TREMOR = {"resonance_amplitude": 0.08, "resonance_frequency": 9.0, "resonance_width": 2.0}
-
-
-def with_tremor() -> jm.Isometric:
-    """A muscle with a twitch of 60 ms and a tremor at 9 Hz."""
-    return jm.model.on_rung(TASK, 2).replace(activation_time=0.06, **TREMOR)
-
-
-def drawn(power: np.ndarray, segments: int, seed: int) -> jm.Target:
-    """A spectrum that scatters about a power by the law of its bins."""
-    law = bin_statistics(jm.Target("x", power, segments=[segments]))
-    normal = np.random.default_rng(seed).multivariate_normal(np.zeros(30), law.correlation)
-    made = power * scipy.stats.gamma.ppf(scipy.stats.norm.cdf(normal), law.half) / law.half
-    return jm.Target(f"drawn {segments} {seed}", made, segments=[segments])
-
-
-def expected(task: jm.Isometric) -> np.ndarray:
-    with jax.enable_x64(True):
-        return np.asarray(jm.expected_spectrum(task).proportional)
-
-
-@functools.cache
-def climbed() -> jm.fits.FitResult:
-    return jm.fit(TASK, drawn(expected(with_tremor()), 90, 1), **QUICK)
 
 
 @functools.cache
@@ -146,12 +122,12 @@ def test_a_muscle_without_activation_and_a_moved_one_have_no_such_prior(x64):
 
 
 def test_the_prior_of_a_fit_is_that_of_all_that_follows(x64):
-    problem = reopened(climbed())
+    problem = reopened(tremor_fit())
     (row,) = problem.damping
-    theta = problem.theta_of((climbed().task,))
+    theta = problem.theta_of((tremor_fit().task,))
     residuals = problem.prior_root @ theta
     assert np.sum(residuals**2) == pytest.approx(np.sum(theta**2) + (row @ theta) ** 2)
-    assert reopened(climbed(), priors={"damping_ratio": None}).damping == ()
+    assert reopened(tremor_fit(), priors={"damping_ratio": None}).damping == ()
 
 
 def test_targets_that_share_a_muscle_have_one_prior_of_its_damping(x64):
@@ -229,7 +205,7 @@ def test_more_starts_count_for_every_model(asked, found):
 
 
 def test_a_tremor_that_is_seen_is_fitted_from_the_first():
-    result = climbed()
+    result = tremor_fit()
     (only,) = result.ladder
     assert only.number == 2 and only.chosen and result.adequate
     found = result.derived["resonance_frequency"]
@@ -358,7 +334,7 @@ def test_a_slow_twitch_is_told_by_the_fit():
 
 
 def test_components_add_up_and_are_what_their_noise_alone_gives(x64):
-    result = climbed()
+    result = tremor_fit()
     parts = result.only.components
     assert set(parts) == {"relaxation", "floor", "harmonic", "resonance"}
     np.testing.assert_allclose(sum(parts.values()), 1.0, rtol=1e-9)
@@ -378,7 +354,7 @@ def test_components_add_up_and_are_what_their_noise_alone_gives(x64):
 
 
 def test_half_power_frequency_against_a_root_of_the_transfer_function(x64):
-    result = climbed()
+    result = tremor_fit()
     task = result.task
     k, c = task.muscle.base()[:2], task.muscle.base()[2:]
     # About x_w at rest: K_w x_w³ and so on, the tangent of the quadratic laws.
@@ -405,7 +381,7 @@ def test_a_band_that_is_hardly_covered_is_left_out():
 def test_bands_are_integrals_over_bins():
     """A bin's power is spread evenly over its width: up to a frequency there is the linearly
     interpolated sum."""
-    result = climbed()
+    result = tremor_fit()
     f, p = result.frequency_hz, result.fitted
     edges = np.append(f - 0.5 * f[0], f[-1] + 0.5 * f[0])
     total = np.append(0.0, np.cumsum(p))
@@ -423,7 +399,7 @@ def test_bands_are_integrals_over_bins():
 
 
 def test_all_that_follows_a_fit_takes_a_model_with_tremor(tmp_path):
-    result = climbed()
+    result = tremor_fit()
     result.save(tmp_path / "fit.json")
     assert str(jm.load_result(tmp_path / "fit.json")) == str(result)
     assert jm.load_preset(tmp_path / "fit.json")["resonance_frequency"] == pytest.approx(

@@ -19,7 +19,7 @@ import jaxmuscle as jm
 from jaxmuscle.data._study_table import Cell
 from jaxmuscle.fits import Estimate, StudyResult, _study
 from jaxmuscle.fits._differences import corrected
-from jaxmuscle.fits._fit_file import Adequacy
+from jaxmuscle.fits._result import Adequacy
 from jaxmuscle.fits._study import USUAL, _checked
 
 PEOPLE, CONDITIONS = 5, ("rest", "tired")

@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb, to_rgba
 
 from jaxmuscle import plot
 from jaxmuscle._common.figures import pixels_of, write_figure
-from jaxmuscle.checks._recovery import Bootstrap, Recovery
+from jaxmuscle.checks._bootstrap import Bootstrap, Recovery
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._rungs import on_rung

@@ -9,7 +9,7 @@ from test_steadiness import trials
 
 import jaxmuscle as jm
 from jaxmuscle.fits import Estimate
-from jaxmuscle.fits._fit_file import Adequacy
+from jaxmuscle.fits._result import Adequacy
 from jaxmuscle.reports._fit_text import _table, fit_card
 
 

@@ -1,6 +1,6 @@
 """Why a model was chosen, in words."""
 
-from jaxmuscle.fits._fit_file import Rung
+from jaxmuscle.fits._result import Rung
 from jaxmuscle.reports._ladder_text import explain_choice
 
 

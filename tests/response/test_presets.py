@@ -12,7 +12,7 @@ from test_scaling import moments
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import PresetError
-from jaxmuscle.fits._fit_file import FORMAT
+from jaxmuscle.fits._result import FORMAT
 from jaxmuscle.model._task_tables import task_to_table
 from jaxmuscle.objective._arguments import at_mean, planned
 from jaxmuscle.objective._options import FitOptions

@@ -18,7 +18,7 @@ from processes import ended, true_python
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
-from jaxmuscle.fits import _half_power
+from jaxmuscle.fits import _intervals
 from jaxmuscle.uncertainty import _posterior_checks as _mixing
 from jaxmuscle.uncertainty import _profile
 
@@ -227,7 +227,7 @@ def once():
         # says what these end at: uncertainty/test_posterior.py and fits/test_intervals.py do.
         for name, value in (("STEPS", np.array([1.2, 2.5])), ("FAR", np.log([30.0])), ("MODES", 1)):
             patch.setattr(_profile, name, value)
-        patch.setattr(_half_power, "TURNS", 3)
+        patch.setattr(_intervals, "TEST_TURNS", 3)
         for called in CALLED_OFTEN:
             wing, _, name = called.rpartition(".")
             home = getattr(jm, wing) if wing else jm

@@ -1,7 +1,8 @@
 """Which colour of noise, with or without a harmonic, or which richer model explains a spectrum."""
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, Unpack
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,40 +14,33 @@ from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._adequacy import Endpoint
+from jaxmuscle.fits._verdict import Endpoint
 from jaxmuscle.model._noises import NOISES, with_noise
-from jaxmuscle.model._parameters import (
-    HARMONIC,
-    PARAMETERS,
-    proper_names,
-    proper_values,
-    unknown_parameter,
-)
+from jaxmuscle.model._parameters import HARMONIC, PARAMETERS, unknown_parameter
 from jaxmuscle.model._rungs import RICHER, on_rung
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._coordinates import task_at
-from jaxmuscle.objective._options import FitOptions
+from jaxmuscle.objective._options import FitOptions, ParameterOptions
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised
 
 from ._comparison import NEEDED, ComparedModel, Comparison, Model, score_difference
 from ._evidence import Candidate, Folds, held_out, masked_bins, maxima, without_harmonic
 
+NAMED = ("free", "fix", "priors", "bounds")  # options that name parameters
 
-def compare_noise(  # noqa: PLR0913 (options of a public call)
+
+def compare_noise(
     task: AbstractTask,
     target: Target,
     *,
     noises: Iterable[str] = (*NOISES, *RICHER),
-    free: Iterable[str] | None = None,
-    fix: Mapping[str, float] | None = None,
-    priors: Mapping[str, float | None] | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
     groups: int = 10,
     key: Key = 0,
     progress: bool | Callable[[str, float], None] = False,
+    **options: Unpack[ParameterOptions],
 ) -> Comparison:
     """Fit a spectrum with every colour of noise, with and without harmonic, and say which can be
     told apart.
@@ -97,11 +91,10 @@ def compare_noise(  # noqa: PLR0913 (options of a public call)
             f"groups = {groups}: give a number from 2 to that of the target's bins,"
             f" {len(target.bins)}"
         )
-    given = {"fix": fix, "priors": priors, "bounds": bounds}
-    given = {argument: proper_values(values) for argument, values in given.items()}
+    given = FitOptions.of(compare_noise, ParameterOptions, options, key=key)
     with told(progress, f"comparing models on {target.name}") as tell, fitting():
-        carried, left_out = _carry(task, noises, given["fix"])
-        problems = _setups(carried, target, proper_names(free), given, key)
+        carried, left_out = _carry(task, noises, given.fix or {})
+        problems = _setups(carried, target, given)
         folds = None if target.segments is None else Folds.of([target], groups)
         found: dict[Model, dict[str, Any]] = {}
         # the poorer ones first: a richer model begins where they ended
@@ -123,7 +116,7 @@ def compare_noise(  # noqa: PLR0913 (options of a public call)
 
 
 def _carry(
-    task: AbstractTask, noises: Iterable[str], fix: dict[str, float]
+    task: AbstractTask, noises: Iterable[str], fix: Mapping[str, float]
 ) -> tuple[dict[str, AbstractTask], dict[str, str]]:
     """The task with each noise, or why it cannot have it."""
     carried: dict[str, AbstractTask] = {}
@@ -150,29 +143,26 @@ def _carry(
 
 
 def _setups(
-    carried: dict[str, AbstractTask],
-    target: Target,
-    free: Iterable[str] | None,
-    given: dict[str, dict[str, Any]],
-    key: Key,
+    carried: dict[str, AbstractTask], target: Target, given: FitOptions
 ) -> dict[str, FitProblem]:
     """The fit of each noise; what concerns a parameter that only other noises have is left to
     them."""
     everywhere = {name for task in carried.values() for name in task.parameter_names}
     everywhere |= {name for name in PARAMETERS if name.startswith("noise_")}
-    for argument, names in ({"free": free or ()} | given).items():
-        for name in names:
+    for argument in NAMED:
+        for name in getattr(given, argument) or ():
             if name not in everywhere:
                 raise ValueError(f"{argument}: {unknown_parameter(name, everywhere)}")
     problems = {}
     for noise, task in carried.items():
         own = set(task.parameter_names) - set(HARMONIC if RICHER.get(noise, 0) > 1 else ())
-        names = None if free is None else [n for n in free if n in own]
         mine: dict[str, Any] = {
-            argument: {n: value for n, value in values.items() if n in own}
-            for argument, values in given.items()
+            argument: {n: x for n, x in (getattr(given, argument) or {}).items() if n in own}
+            for argument in NAMED[1:]
         }
-        problems[noise] = planned(task, target, FitOptions(free=names, key=key, **mine)).problem
+        if given.free is not None:
+            mine["free"] = [n for n in given.free if n in own]
+        problems[noise] = planned(task, target, dataclasses.replace(given, **mine)).problem
     return problems
 
 

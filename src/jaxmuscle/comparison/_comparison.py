@@ -16,14 +16,13 @@ from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._adequacy import ADEQUATE
+from jaxmuscle.fits._verdict import ADEQUATE
 from jaxmuscle.model._rungs import RICHER, RUNGS
 from jaxmuscle.model._task_tables import task_to_table
 from jaxmuscle.model._tasks import AbstractTask
 
 if TYPE_CHECKING:
     import pandas
-    import xarray
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
@@ -308,35 +307,6 @@ class Comparison(Printed, Result, eqx.Module):
     def to_dataframe(self) -> "pandas.DataFrame":
         """The rows of `table`."""
         return frame(self.table())
-
-    def to_xarray(self) -> "xarray.Dataset":
-        """The numbers over (noise, harmonic), `fitted` and `scores` over frequency as well; NaN for
-        what there is not."""
-        import xarray
-
-        noises, present = list(dict.fromkeys(row.noise for row in self.rows)), [True, False]
-        dims, shape = ("noise", "harmonic"), (len(noises), 2)
-        whole = *shape, len(self.target.bins)
-        data: dict[str, Any] = {name: (dims, np.full(shape, np.nan)) for name in NUMBERS}
-        for name in ("fitted", "scores"):
-            data[name] = (*dims, "frequency"), np.full(whole, np.nan)
-        data["success"] = dims, np.zeros(shape, bool)
-        for row in self.rows:
-            at = noises.index(row.noise), present.index(row.harmonic)
-            values = vars(row) | {"fitted": self.fitted[row.noise, row.harmonic]}
-            for name, (_, grid) in data.items():
-                grid[at] = values[name]  # None becomes NaN
-        return xarray.Dataset(
-            data | {"target": ("frequency", self.target.proportional_power)},
-            coords={
-                "noise": noises,
-                "harmonic": present,
-                "frequency": ("frequency", self.target.frequency, {"units": "Hz"}),
-            },
-            attrs={"target_name": self.target.name, "verdict": "\n".join(self.verdict)}
-            | {f"left_out_{name}": why for name, why in self.left_out.items()}
-            | {f"version_{package}": number for package, number in self.versions.items()},
-        )
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as nested tables, the fitted tasks as presets are."""

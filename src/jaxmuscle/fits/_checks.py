@@ -1,5 +1,6 @@
-"""What is checked about a fit: nonlinear against linear, other minima, transients; and what is said
-about it."""
+"""What looks wrong about a fit, in sentences: other minima, a nonlinear response, numbers that no
+muscle has. `_report.py` asks for it; `controlled_moments` and `seen_best` serve the search, too.
+"""
 
 import dataclasses
 from collections import Counter
@@ -35,8 +36,7 @@ from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import BinStatistics, recorded_interval, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._fit_file import Start
-from ._part import Estimate, FittedPart
+from ._result import Estimate, FittedPart, Start
 
 AMBIGUOUS, OTHER = 2.0, 3.0
 ALIKE = 0.5  # of costs: one minimum

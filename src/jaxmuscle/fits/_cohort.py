@@ -1,7 +1,7 @@
-"""Many targets fitted together, and what differs between groups of them."""
+"""Many targets fitted together, and what differs between groups of them: `jm.fit_cohort`. It
+gives all of them to `search_together` of `_search.py`; `_study.py` calls it.
+"""
 
-import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Unpack
@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Card, Result
-from jaxmuscle._common.environment import fitting, versions
+from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.upward import load_above
@@ -25,37 +25,16 @@ from jaxmuscle.objective._options import FitOptions, SearchOptions
 from jaxmuscle.spectra._bin_law import trial_samples
 from jaxmuscle.spectra._fluctuations import BANDS
 
-from ._differences import Difference, difference
-from ._ladder import options_for
-from ._part import Estimate
+from ._differences import Difference, between_groups
+from ._model_choice import options_for
 from ._perturbed import aimed
 from ._result import FitResult
 from ._search import search_together
 
 if TYPE_CHECKING:
     import pandas
-    import xarray
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
-
-
-COLUMNS = (
-    "target",
-    "group",
-    "quantity",
-    "kind",
-    "value",
-    "stderr",
-    "low",
-    "high",
-    "unit",
-    "determined",
-    "mvc_fraction",
-    "chi2_per_bin",
-    "adequate",
-    "adequacy_p",
-    "success",
-)
 
 
 class CohortResult(Result, eqx.Module):
@@ -104,81 +83,34 @@ class CohortResult(Result, eqx.Module):
 
         `low` and `high` are the ends of the 95 % interval.
         """
-        return [
-            dict(
-                zip(
-                    COLUMNS,
-                    (
-                        name,
-                        self.groups.get(name, ""),
-                        quantity,
-                        "measured" if isinstance(e, Measure) else "model",
-                        e.value,
-                        e.stderr,
-                        *_ends(e),
-                        e.unit,
-                        e.stderr is not None,
-                        result.target.mvc_fraction,
-                        result.chi2_per_bin,
-                        result.adequate,
-                        result.adequacy_p,
-                        result.success,
-                    ),
-                    strict=True,
+        rows = []
+        for name, result in self.results.items():
+            for quantity, e in _quantities(result).items():
+                low, high = (None, None) if e.interval is None else e.interval
+                rows.append(
+                    {
+                        "target": name,
+                        "group": self.groups.get(name, ""),
+                        "quantity": quantity,
+                        "kind": "measured" if isinstance(e, Measure) else "model",
+                        "value": e.value,
+                        "stderr": e.stderr,
+                        "low": low,
+                        "high": high,
+                        "unit": e.unit,
+                        "determined": e.stderr is not None,
+                        "mvc_fraction": result.target.mvc_fraction,
+                        "chi2_per_bin": result.chi2_per_bin,
+                        "adequate": result.adequate,
+                        "adequacy_p": result.adequacy_p,
+                        "success": result.success,
+                    }
                 )
-            )
-            for name, result in self.results.items()
-            for quantity, e in _quantities(result).items()
-        ]
+        return rows
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """The rows of `table`."""
         return frame(self.table())
-
-    def to_xarray(self) -> "xarray.Dataset":
-        """`value`, `stderr`, `low`, `high` (NaN where there is none) and `determined` over (target,
-        quantity).
-
-        `low` and `high` are the ends of the 95 % interval; units are a coordinate.
-        """
-        import xarray
-
-        names = list(
-            dict.fromkeys(q for result in self.results.values() for q in _quantities(result))
-        )
-        units = {
-            q: e.unit for result in self.results.values() for q, e in _quantities(result).items()
-        }
-
-        def grid(read: Callable[[Any], Any], missing: Any) -> list[list[Any]]:
-            tables = [_quantities(result) for result in self.results.values()]
-            return [[read(t[q]) if q in t else missing for q in names] for t in tables]
-
-        dims = ("target", "quantity")
-        results = self.results.values()
-        return xarray.Dataset(
-            {
-                "value": (dims, grid(lambda e: e.value, np.nan)),
-                "stderr": (dims, grid(lambda e: _or_nan(e.stderr), np.nan)),
-                "low": (dims, grid(lambda e: _or_nan(_ends(e)[0]), np.nan)),
-                "high": (dims, grid(lambda e: _or_nan(_ends(e)[1]), np.nan)),
-                "determined": (dims, grid(lambda e: e.stderr is not None, False)),
-                "chi2_per_bin": ("target", [_or_nan(result.chi2_per_bin) for result in results]),
-                "adequacy_p": ("target", [_or_nan(result.adequacy_p) for result in results]),
-                "success": ("target", [result.success for result in results]),
-            },
-            coords={
-                "target": list(self.results),
-                "quantity": names,
-                "unit": ("quantity", [units[q] for q in names]),
-                "group": ("target", [self.groups.get(name, "") for name in self.results]),
-                "mvc_fraction": (
-                    "target",
-                    [_or_nan(result.target.mvc_fraction) for result in results],
-                ),
-            },
-            attrs={f"version_{package}": number for package, number in versions().items()},
-        )
 
     def differences(self) -> tuple[Difference, ...]:
         """Every quantity that is measured or determined, every two groups: difference of the means
@@ -187,38 +119,21 @@ class CohortResult(Result, eqx.Module):
         Members whose data do not determine the quantity, and of the model's those that it does not
         describe, are `left_out`.
         """
-        known = {name: comparable(result) for name, result in self.results.items()}
-        members: dict[str, list[str]] = {}
-        for name in known:
-            members.setdefault(self.groups.get(name, ""), []).append(name)
+        known = {
+            name: (self.groups.get(name, ""), comparable(result))
+            for name, result in self.results.items()
+        }
+        groups = dict.fromkeys(group for group, _ in known.values())
         found = []
-        for quantity in dict.fromkeys(q for table in known.values() for q in table):
-            for a, b in itertools.combinations(members, 2):
-                left, right = (
-                    [known[name][quantity] for name in members[group] if quantity in known[name]]
-                    for group in (a, b)
-                )
-                sure = all(e.stderr is not None for e in (*left, *right))
-                # of a single member its own error is all there is
-                if left and right and (sure or min(len(left), len(right)) > 1):
-                    out = len(members[a]) + len(members[b]) - len(left) - len(right)
-                    made = difference(quantity, (a, left), (b, right))
-                    found.append(dataclasses.replace(made, left_out=out))
+        for quantity in dict.fromkeys(q for _, table in known.values() for q in table):
+            numbers = [(group, table.get(quantity)) for group, table in known.values()]
+            found += between_groups(quantity, groups, numbers, single=True)
         return tuple(found)
 
     def plot(self, by: str = "person", ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Determined quantities with their standard errors, by "person", "group" or "level"
         (fraction of MVC)."""
         return plot.cohort(self, by, ax)
-
-
-def _or_nan(value: float | None) -> float:
-    return np.nan if value is None else float(value)
-
-
-def _ends(estimate: Estimate | Measure) -> tuple[float | None, float | None]:
-    """Of the 95 % interval."""
-    return (None, None) if estimate.interval is None else estimate.interval
 
 
 def _quantities(result: FitResult) -> dict[str, Any]:

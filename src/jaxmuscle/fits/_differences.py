@@ -1,8 +1,10 @@
-"""Differences between groups and between conditions, their intervals and p-values, corrected for
-many comparisons."""
+"""Differences between groups and between conditions, their intervals and p-values, corrected
+for many comparisons. `_cohort.py` and `_study.py` call it.
+"""
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -11,7 +13,7 @@ import scipy
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._measure import Measure
 
-from ._part import Estimate
+from ._result import Estimate
 
 Number = Estimate | Measure
 CONFIDENCE = 0.95
@@ -87,6 +89,31 @@ def difference(
         (len(left), len(right)),
         float(p),
     )
+
+
+def between_groups(
+    quantity: str,
+    groups: Iterable[str],
+    numbers: Sequence[tuple[str, Number | None]],
+    confidence: float = CONFIDENCE,
+    *,
+    kind: str = "groups",
+    where: str = "",
+    single: bool = False,
+) -> Iterator[Difference]:
+    """Every two groups that both have two members with a number; members without one, None among
+    the `numbers`, are `left_out`.
+
+    With `single` also a group of one, where all numbers have an error: that is then all there is.
+    """
+    for pair in itertools.combinations(groups, 2):
+        a, b = ((group, [e for g, e in numbers if g == group and e is not None]) for group in pair)
+        fewest = min(len(a[1]), len(b[1]))
+        sure = single and fewest and all(e.stderr is not None for e in (*a[1], *b[1]))
+        if fewest > 1 or sure:
+            found = difference(quantity, a, b, confidence)
+            left_out = sum(group in pair and e is None for group, e in numbers)
+            yield dataclasses.replace(found, kind=kind, where=where, left_out=left_out)
 
 
 def paired(

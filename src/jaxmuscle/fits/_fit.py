@@ -19,7 +19,7 @@ from jaxmuscle.objective._arguments import Plan, at_mean, planned
 from jaxmuscle.objective._options import FitOptions, JointFitOptions, OneFitOptions
 
 from ._joint import fit_jointly
-from ._ladder import Models, first_rung, options_for
+from ._model_choice import Models, first_rung, options_for
 from ._perturbed import ANEW, alike, analysed, recordings_of, seen_with, without_rhythm
 from ._result import FitResult
 from ._search import search

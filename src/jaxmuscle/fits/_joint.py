@@ -30,7 +30,7 @@ from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._scaling import is_scalable, times_force
 
-from ._ladder import Models, first_rung
+from ._model_choice import Models, first_rung
 from ._perturbed import ANEW, aimed, alike, recordings_of, seen_with
 from ._result import FitResult
 from ._search import search

@@ -1,4 +1,6 @@
-"""A fit as functions of numbers, for optimisers and samplers of one's own."""
+"""A fit as functions of numbers, for optimisers and samplers of one's own: `jm.fits.problem`. No
+other file calls it.
+"""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,5 +1,6 @@
-"""Perturbed recordings as the target of a fit: the response to the perturbation is taken off by the
-model that is fitted."""
+"""Perturbed recordings as the target of a fit: the response to the perturbation is taken off by
+the model that is fitted. `_fit.py`, `_joint.py` and `_cohort.py` begin with it.
+"""
 
 import dataclasses
 from collections.abc import Sequence

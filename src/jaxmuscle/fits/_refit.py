@@ -1,5 +1,6 @@
 """What a refit leaves of residuals, to first order, but with the line of the harmonic sought
-anew."""
+anew. The verdict and the test of the harmonic compare data with such refits.
+"""
 
 from typing import NamedTuple
 

@@ -1,5 +1,6 @@
-"""A fit taken up again: from its result back to the problem, for likelihoods, profiles and
-posteriors."""
+"""A fit taken up again: from its result back to the problem. Likelihoods, profiles, posteriors
+and checks of a fit begin with it.
+"""
 
 import dataclasses
 from collections.abc import Iterable, Mapping

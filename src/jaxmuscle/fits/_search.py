@@ -1,5 +1,6 @@
 """The search of a fit: many starts, the best minima polished, whatever was reached when
-interrupted."""
+interrupted. `_fit.py` and `_joint.py` call `search`, cohorts and bootstraps `search_together`.
+"""
 
 import dataclasses
 import functools
@@ -24,12 +25,11 @@ from jaxmuscle.objective._starts import contenders, kinds_of_starts, recombined,
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
-from ._adequacy import Endpoint
 from ._checks import AMBIGUOUS, Stage, controlled_moments, seen_best
-from ._fit_file import Rung
-from ._ladder import Climbed, Models, climb, rung_of
+from ._model_choice import Climbed, Models, climb, rung_of
 from ._report import UNCHECKED, report_fit
-from ._result import FitResult
+from ._result import FitResult, Rung
+from ._verdict import Endpoint
 
 FIRST_STEPS = 12
 MOST_RIVALS = 3

@@ -1,5 +1,6 @@
 """What the mean spectrum of recordings cannot show: fluctuations that change their size, a sharp
-rhythm."""
+rhythm. `Endpoint` of `_verdict.py` asks for it.
+"""
 
 import functools
 import math

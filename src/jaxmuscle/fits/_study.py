@@ -17,11 +17,10 @@ import numpy as np
 
 from jaxmuscle import plot
 from jaxmuscle._common.arguments import check_options
-from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.cards import Card, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.figures import remove_figures, write_figure
-from jaxmuscle._common.files import remove, write_json, write_text
+from jaxmuscle._common.files import nulled, remove, write_json, write_text
 from jaxmuscle._common.keys import check_key
 from jaxmuscle._common.progress import Tell, told
 from jaxmuscle._common.tables import csv_of, frame
@@ -36,8 +35,8 @@ from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._derived import DERIVED
 
 from ._cohort import CohortResult, fit_cohort
-from ._differences import CORRECTIONS, Difference, Number, change, corrected, difference, paired
-from ._part import ALIASES, estimates_to_table
+from ._differences import CORRECTIONS, Difference, Number, between_groups, change, corrected, paired
+from ._result import ALIASES
 
 if TYPE_CHECKING:
     import pandas
@@ -215,15 +214,17 @@ class StudyResult(Result, eqx.Module):
         return tuple(each for family in families.values() for each in corrected(family, correction))
 
     def _between_groups(self, quantity: str, numbers: Numbers) -> Iterable[Difference]:
+        level = 1 - self.options["alpha"]
         for condition in self.conditions:
             known = [
                 (cell.group, numbers[cell.person, condition])
                 for cell in self.cells
                 if cell.condition == condition
             ]
-            yield from self._compared(quantity, known, "groups", condition)
+            yield from between_groups(quantity, self.groups, known, level, where=condition)
 
     def _within_people(self, quantity: str, numbers: Numbers) -> Iterable[Difference]:
+        level = 1 - self.options["alpha"]
         for a, b in itertools.combinations(self.conditions, 2):
             changes = []
             for person, group in self.people.items():
@@ -232,22 +233,12 @@ class StudyResult(Result, eqx.Module):
                     changes.append((group, None if x is None or y is None else change(x, y)))
             known = [each for _, each in changes if each is not None]
             if len(known) > 1:
-                found = paired(quantity, a, b, known, 1 - self.options["alpha"])
+                found = paired(quantity, a, b, known, level)
                 yield dataclasses.replace(found, left_out=len(changes) - len(known))
-            yield from self._compared(quantity, changes, "interaction", f"{b} - {a}")
-
-    def _compared(
-        self, quantity: str, numbers: list[tuple[str, Number | None]], kind: str, where: str
-    ) -> Iterable[Difference]:
-        """Every two groups."""
-        for pair in itertools.combinations(self.groups, 2):
-            a, b = (
-                (group, [e for g, e in numbers if g == group and e is not None]) for group in pair
+            where = f"{b} - {a}"
+            yield from between_groups(
+                quantity, self.groups, changes, level, kind="interaction", where=where
             )
-            if min(len(a[1]), len(b[1])) > 1:
-                found = difference(quantity, a, b, 1 - self.options["alpha"])
-                left_out = sum(g in pair and e is None for g, e in numbers)
-                yield dataclasses.replace(found, kind=kind, where=where, left_out=left_out)
 
     def methods(self) -> str:
         """A paragraph for the methods section of a paper: people, recordings, spectra, model,
@@ -364,26 +355,19 @@ def _row(difference: Difference) -> dict[str, Any]:
 
 def to_table(study: StudyResult) -> dict[str, Any]:
     """What study.json holds."""
-    rows = [_nulled(_row(d)) for d in study.differences()]
-    return {
+    table = {
         "format": FORMAT,
         "source": study.source,
         "options": study.options,
         "model": {"rung": study.rung, "name": RUNGS[study.rung]} if study.aic else None,
-        "aic": {str(number): with_nulls(aic) for number, aic in study.aic.items()},
-        "table_1": [_nulled(row) for row in study.table_1()],
+        "aic": {str(number): aic for number, aic in study.aic.items()},
+        "table_1": study.table_1(),
         "fits": [_fit_to_table(cell, study.cohort) for cell in study.cells],
-        "differences": rows,
+        "differences": [_row(d) for d in study.differences()],
         "methods": study.methods(),
         "versions": versions(),
     }
-
-
-def _nulled(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: with_nulls(value) if isinstance(value, float) else value
-        for name, value in row.items()
-    }
+    return nulled(table)
 
 
 def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
@@ -392,15 +376,15 @@ def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
         "person": cell.person,
         "group": cell.group,
         "condition": cell.condition,
-        "rates_hz": list(cell.rates),
-        "segments": list(target.segments or ()),
+        "rates_hz": cell.rates,
+        "segments": target.segments or (),
         "source": target.source,
-        "notices": list(target.notices),
+        "notices": target.notices,
         "dispersion": None if target.dispersion is None else target.dispersion[0],
         "unit": target.unit,
-        "measured": {name: _nulled(m.row()) for name, m in target.measured.items()},
-        "frequency_hz": target.frequency.tolist(),
-        "proportional_power": target.proportional_power.tolist(),
+        "measured": {name: m.row() for name, m in target.measured.items()},
+        "frequency_hz": target.frequency,
+        "proportional_power": target.proportional_power,
     }
     if result is None:
         return own | {"failed": cohort.failed.get(target.name)}
@@ -409,8 +393,8 @@ def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
         "verdict": result.verdict,
         "adequate": result.adequate,
         "adequacy_p": result.adequacy_p,
-        "fitted": with_nulls(result.fitted),
-        "estimates": estimates_to_table(result.found),
+        "fitted": result.fitted,
+        "estimates": {name: vars(p) for name, p in result.found.items()},
     }
 
 

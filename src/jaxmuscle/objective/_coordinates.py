@@ -41,7 +41,7 @@ class Coordinates(eqx.Module):
     ) -> "Coordinates":
         """Coordinates about the given values. Raises `ValueError` for one that cannot be fitted."""
         rows = {name: PARAMETERS.get(name, _generic(name)) for name in values}
-        low, high = [], []
+        ends = []
         for name, value in values.items():
             row = rows[name]
             a, b = bounds.get(name, (row.fit_lower, row.fit_upper))
@@ -54,17 +54,17 @@ class Coordinates(eqx.Module):
                 raise ValueError(
                     f"{name} = {value} {row.unit} must lie inside its bounds ({a}, {b})"
                 )
-            low.append(
-                (_log(a) - np.log(value)) / sds[name] if row.positive else (a - value) / sds[name]
-            )
-            high.append(
-                (_log(b) - np.log(value)) / sds[name] if row.positive else (b - value) / sds[name]
+            ends.append(
+                [
+                    (_log(end) - np.log(value) if row.positive else end - value) / sds[name]
+                    for end in (a, b)
+                ]
             )
         positive = np.array([rows[name].positive for name in values])
         centre = np.array([float(v) for v in values.values()])
         sd = np.array([sds[name] for name in values])
         return cls(
-            tuple(values), centre, sd, positive, *_both_or_none(np.array(low), np.array(high))
+            tuple(values), centre, sd, positive, *_both_or_none(*np.reshape(ends, (-1, 2)).T)
         )
 
     def filled(self, more: int) -> "Coordinates":

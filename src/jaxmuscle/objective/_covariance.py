@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import block_diag
 
 from jaxmuscle.data._target import Target
 from jaxmuscle.spectra._bin_law import log_power_moments, welch_law
@@ -229,9 +230,4 @@ def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) 
     total = spread @ (measured + simulated) @ spread.T
     if variation is not None:
         rows[0] += 0.25 * float(p @ simulated @ p) / float(variation[1]) ** 2
-    return np.block(
-        [
-            [total, np.zeros((len(total), len(rows)))],
-            [np.zeros((len(rows), len(total))), np.diag(rows)],
-        ]
-    )
+    return np.asarray(block_diag(total, np.diag(rows)))

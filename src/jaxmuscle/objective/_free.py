@@ -16,7 +16,7 @@ from jaxmuscle.model._tasks import AbstractTask
 
 from ._arguments import check_names, tremor_bounds
 from ._coordinates import Coordinates, task_at
-from ._given import check_named
+from ._options import check_named
 
 Vector = Float[Array | np.ndarray, " free"]
 

@@ -1,6 +1,7 @@
 """The residuals of a fit: what each target and the prior contribute, of one target or of
 several."""
 
+import itertools
 from typing import Any
 
 import equinox as eqx
@@ -109,6 +110,12 @@ class Residuals(eqx.Module):
     def data(self) -> tuple[Data, ...]:
         """Data of every part."""
         return tuple(part.data for part in self.parts)
+
+    @property
+    def rows(self) -> tuple[slice, ...]:
+        """Which data residuals are those of each part: bins first, the dynamic stiffness last."""
+        counts = [len(part.statistics.sd) + part.data.further for part in self.parts]
+        return tuple(slice(a, b) for a, b in itertools.pairwise(np.cumsum([0, *counts]).tolist()))
 
     def theta(
         self, s: Float[Array | np.ndarray, "*rows free"]

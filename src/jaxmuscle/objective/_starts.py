@@ -338,6 +338,12 @@ def frequency_names(coordinates: Coordinates) -> list[str]:
     return [name for name in coordinates.names if name.partition("@")[0] == "harmonic_frequency"]
 
 
+def amplitude_columns(names: tuple[str, ...], frequency: str) -> list[int]:
+    """Where among the names the amplitude stands that goes with a harmonic frequency."""
+    own = "harmonic_amplitude", frequency.replace("frequency", "amplitude")
+    return [i for i, name in enumerate(names) if name in own]
+
+
 def contenders(problem: FitProblem, minima: Minima, margin: float) -> list[int]:
     """The best start, then those whose cost is at most `margin` above it at another harmonic
     frequency, best first.
@@ -424,11 +430,6 @@ def points_about(problem: FitProblem, theta: np.ndarray) -> np.ndarray:
         points[:, names.index(name)] = problem.coordinates.theta_of(
             name, frequencies_for(problem, name, FREQUENCIES - 1)
         )
-        amplitudes = [
-            i
-            for i, n in enumerate(names)
-            if n in ("harmonic_amplitude", name.replace("frequency", "amplitude"))
-        ]
-        points[np.ix_(range(0, len(points), 2), amplitudes)] = 0.0
+        points[np.ix_(range(0, len(points), 2), amplitude_columns(names, name))] = 0.0
         found.append(points)
     return np.concatenate(found)

@@ -10,8 +10,7 @@ from jaxmuscle._common.text import folded
 from jaxmuscle.data._measured import is_recorded, tremor_band
 from jaxmuscle.data._measured_text import REGULAR, TREMOR, WORDS, measured_line, tremor_lines
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._part import RELATIVE, Estimate, FittedPart, once
-from jaxmuscle.fits._result import FitResult
+from jaxmuscle.fits._result import RELATIVE, Estimate, FitResult, FittedPart, once
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._derived import MEAN, MEANINGS, VARIATION

@@ -3,7 +3,7 @@
 import itertools
 
 from jaxmuscle._common.text import probability
-from jaxmuscle.fits._fit_file import Rung
+from jaxmuscle.fits._result import Rung
 from jaxmuscle.model._rungs import RICHER
 
 

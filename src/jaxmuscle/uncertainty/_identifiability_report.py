@@ -17,7 +17,7 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
-from jaxmuscle.fits._part import ALIASES, RELATIVE, in_use
+from jaxmuscle.fits._result import ALIASES, RELATIVE, in_use
 from jaxmuscle.objective._covariance import DETERMINED, spelt
 from jaxmuscle.objective._derived import MEAN
 

@@ -1,9 +1,10 @@
-"""Does the model describe the data? Chi² of a fit against its distribution under the fitted model,
-and where it fails."""
+"""Does the model describe the data? `Endpoint` holds what follows from where a fit ended: chi²
+against its distribution under the fitted model, where it fails, errors and intervals. The choice
+of the model and the report read it.
+"""
 
 import dataclasses
 import functools
-import itertools
 
 import jax
 import numpy as np
@@ -14,7 +15,6 @@ from scipy.special import gammaincinv, ndtr
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import probability
-from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import Consequences, Expansion, consequences
 from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
 from jaxmuscle.objective._problem import FitProblem
@@ -22,10 +22,9 @@ from jaxmuscle.objective._residuals import PartResiduals, Residuals, further_res
 from jaxmuscle.response._expected import Moments
 
 from ._checks import Stage, seen_best
-from ._fit_file import ADEQUATE, Adequacy
-from ._half_power import HALF_POWER, half_power_intervals
 from ._intervals import Interval, intervals
 from ._refit import STRENGTHS, Refit, refit_of
+from ._result import ADEQUATE, Adequacy
 from ._signal_checks import SignalTest, check_signals
 
 ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
@@ -119,9 +118,8 @@ class Endpoint:
     def intervals(self, names: list[str]) -> dict[str, Interval]:
         """95 % intervals of these quantities; computed once."""
         new = {name: self.widening for name in names if name not in self._ends}
-        bent = {name: new.pop(name) for name in list(new) if base_of(name) == HALF_POWER}
         where = self.problem, self.objective, self.seen, self.covariance
-        self._ends.update(intervals(*where, new) | half_power_intervals(*where, bent))
+        self._ends.update(intervals(*where, new))
         return {n: self._ends[n] for n in names if n in self._ends}
 
 
@@ -203,15 +201,13 @@ def _tested(residuals: np.ndarray, rest: np.ndarray) -> tuple[float, float, floa
 
 def _kinds(problem: FitProblem, objective: Residuals) -> dict[str, slice]:
     """Rows of each target's spectrum and dynamic stiffness, by what they are in words."""
-    start, kinds = 0, dict[str, slice]()
-    for part, own in zip(problem.parts, objective.parts, strict=True):
+    kinds = dict[str, slice]()
+    for part, own, rows in zip(problem.parts, objective.parts, objective.rows, strict=True):
         of = f" of {part.name}" if len(problem.parts) > 1 else ""
-        end = start + _rows_of(own)
-        if bins := _rows_of(own) - own.data.further:
-            kinds[f"the spectrum{of}"] = slice(start, start + bins)
+        if bins := len(own.statistics.sd):
+            kinds[f"the spectrum{of}"] = slice(rows.start, rows.start + bins)
         if part.points is not None:
-            kinds[f"the dynamic stiffness{of}"] = slice(end - 2 * len(part.points), end)
-        start = end
+            kinds[f"the dynamic stiffness{of}"] = slice(rows.stop - 2 * len(part.points), rows.stop)
     return kinds
 
 
@@ -270,94 +266,77 @@ def _drawn(objective: Residuals, scatter: np.ndarray, generator: np.random.Gener
     drawn = generator.multivariate_normal(
         np.zeros(len(scatter)), scatter, size=REPLICATES, method="eigh"
     )
-    start = 0
-    for part in objective.parts:
+    for part, rows in zip(objective.parts, objective.rows, strict=True):
         bins = len(part.statistics.sd)
         if objective.linear and bins:
-            drawn[:, start : start + bins] = drawn_log_residuals(part, generator, REPLICATES)
-        start += _rows_of(part)
+            own = drawn_log_residuals(part, generator, REPLICATES)
+            drawn[:, rows.start : rows.start + bins] = own
     return drawn
-
-
-def rows_of(ended: Endpoint) -> list[slice]:
-    """Which residuals are those of each target."""
-    ends = np.cumsum([0, *(_rows_of(part) for part in ended.objective.parts)])
-    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
-
-
-def _rows_of(part: PartResiduals) -> int:
-    return len(part.statistics.sd) + part.data.further
 
 
 def _misfit(
     problem: FitProblem, objective: Residuals, residuals: np.ndarray, covariance: np.ndarray
 ) -> str:
-    """In words, the run of neighbouring bins whose residuals have the largest sum in its standard
-    errors.
+    """In words, where the data lie furthest from the model: the run of neighbouring bins, or the
+    point of a dynamic stiffness, that is the most of its standard errors off."""
+    found = [(0.0, "")]
+    for part, own, rows in zip(problem.parts, objective.parts, objective.rows, strict=True):
+        whose = f"{part.name} has" if len(problem.parts) > 1 else "the data have"
+        bins = slice(rows.start, rows.start + len(own.statistics.sd))
+        if part.points is not None:
+            each = residuals[rows.stop - 2 * len(part.points) : rows.stop].reshape(2, -1)
+            off = np.sqrt(np.sum(each**2, axis=0))
+            i = int(np.argmax(off))
+            said = (
+                f"{whose} another dynamic stiffness than the model at {part.points[i]:.2g} Hz"
+                f" ({off[i]:.1f} standard errors)"
+            )
+            found.append((float(off[i]), said))
+        if len(own.statistics.sd):
+            size, said = _worst_run(part.target.frequency, residuals[bins], covariance[bins, bins])
+            found.append((size, f"{whose} {said}"))
+    return max(found, key=lambda each: each[0])[1]
+
+
+def _worst_run(
+    frequency: Float[np.ndarray, " bins"],
+    residuals: Float[np.ndarray, " bins"],
+    covariance: Float[np.ndarray, "bins bins"],
+) -> tuple[float, str]:
+    """The run of neighbouring bins whose residuals have the largest sum in its standard errors:
+    this size, and the run in words.
 
     No bin in it is off by more than one standard deviation the other way.
     """
-    whose = {
-        part.name: f"{part.name} has" if len(problem.parts) > 1 else "the data have"
-        for part in problem.parts
-    }
-    start, worst = 0, (0.0, "")
-    for part, own in zip(problem.parts, objective.parts, strict=True):
-        bins = _rows_of(own) - own.data.further
-        rows, points = slice(start, start + bins), part.points
-        start += _rows_of(own)
-        if points is not None:
-            each = residuals[start - 2 * len(points) : start].reshape(2, -1)
-            off = np.sqrt(np.sum(each**2, axis=0))
-            i = int(np.argmax(off))
-            if off[i] > abs(worst[0]):
-                worst = (
-                    off[i],
-                    (
-                        f"{whose[part.name]} another dynamic stiffness than the model at"
-                        f" {points[i]:.2g} Hz ({off[i]:.1f} standard errors)"
-                    ),
-                )
-        if not bins:
-            continue
-        size = np.concatenate([[0.0], np.cumsum(residuals[rows])])
-        spread = np.zeros((bins + 1, bins + 1))
-        spread[1:, 1:] = np.cumsum(np.cumsum(covariance[rows, rows], axis=0), axis=1)
-        corner = np.diag(spread)
-        variance = corner[:, None] + corner[None] - 2 * spread
-        first, last = np.triu_indices(bins + 1, 1)
-        # A run that the fit has taken up has hardly any variance of its own.
-        ratio = (size[last] - size[first]) / np.sqrt(
-            np.maximum(variance[first, last], 0.1 * (last - first))
-        )
-        # Where a bin is clearly off the other way, the figure shows no such run.
-        mixed = [
-            np.min(np.sign(x) * residuals[rows][a:b]) < -1.0
-            for x, a, b in zip(ratio, first, last, strict=True)
-        ]
-        ratio[mixed] = 0.0
-        i = int(np.argmax(np.abs(ratio)))
-        if abs(ratio[i]) > abs(worst[0]):
-            low, high = part.target.frequency[first[i]], part.target.frequency[last[i] - 1]
-            place = (
-                f"at {low:.2g} Hz"
-                if last[i] - first[i] == 1
-                else f"from {low:.2g} to {high:.2g} Hz"
-            )
-            more = "more" if ratio[i] > 0 else "less"
-            said = (
-                f"{whose[part.name]} {more} power than the model {place} ({abs(ratio[i]):.1f}"
-                " standard errors)"
-            )
-            # What else the eye finds in the figure.
-            apart = residuals[rows].copy()
-            apart[first[i] : last[i]] = 0.0
-            k = int(np.argmax(np.abs(apart)))
-            largest = float(apart[k])
-            if abs(largest) > ALONE:
-                said += (
-                    f", and {'more' if largest > 0 else 'less'} at"
-                    f" {part.target.frequency[k]:.2g} Hz"
-                )
-            worst = ratio[i], said
-    return worst[1]
+    bins = len(residuals)
+    size = np.append(0.0, np.cumsum(residuals))
+    spread = np.zeros((bins + 1, bins + 1))
+    spread[1:, 1:] = np.cumsum(np.cumsum(covariance, axis=0), axis=1)
+    corner = np.diag(spread)
+    variance = corner[:, None] + corner[None] - 2 * spread
+    first, last = np.triu_indices(bins + 1, 1)
+    # A run that the fit has taken up has hardly any variance of its own.
+    ratio = (size[last] - size[first]) / np.sqrt(
+        np.maximum(variance[first, last], 0.1 * (last - first))
+    )
+    # Where a bin is clearly off the other way, the figure shows no such run.
+    mixed = [
+        np.min(np.sign(x) * residuals[a:b]) < -1.0
+        for x, a, b in zip(ratio, first, last, strict=True)
+    ]
+    ratio[mixed] = 0.0
+    i = int(np.argmax(np.abs(ratio)))
+    run = slice(first[i], last[i])
+    low, high = frequency[run][[0, -1]]
+    place = f"at {low:.2g} Hz" if low == high else f"from {low:.2g} to {high:.2g} Hz"
+    said = (
+        f"{'more' if ratio[i] > 0 else 'less'} power than the model {place} ({abs(ratio[i]):.1f}"
+        " standard errors)"
+    )
+    # What else the eye finds in the figure.
+    apart = residuals.copy()
+    apart[run] = 0.0
+    k = int(np.argmax(np.abs(apart)))
+    if abs(apart[k]) > ALONE:
+        said += f", and {'more' if apart[k] > 0 else 'less'} at {frequency[k]:.2g} Hz"
+    return float(abs(ratio[i])), said
