@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -294,7 +295,9 @@ def fit(
                 options["tasks"] = {
                     name: jm.model.on_rung(base, rung) for name, base in bases.items()
                 }
-            converged = _fit_with_holds(*given, output, options, figures, everything=everything)
+            targets = {"moved": given[0], "held": given[1].target()}
+            asked = partial(jm.fit_joint, targets, **options)
+            called = "the moved and the held record"
         else:
             options |= {
                 "method": str(method),
@@ -313,7 +316,9 @@ def fit(
             writable(output, "fit.json", beside=beside, reads=target, force=force)
             if rung is not None:
                 model = jm.model.on_rung(model, rung)
-            converged = _fit_alone(seen, model, output, options, figures, everything=everything)
+            asked = partial(jm.fit, model, seen, **options)
+            called = seen[0].name if isinstance(seen, list) else seen.name
+        converged = _fit_one(asked, called, output, figures, everything=everything)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
@@ -414,46 +419,8 @@ def _aim_at_spectrum(
     return aim_of(name, task, {"segments": read["segments"], "lever_arm": reading["lever_arm"]})
 
 
-def _fit_alone(
-    seen: Any,
-    model: Any,
-    folder: Path,
-    options: dict[str, Any],
-    formats: list[str],
-    *,
-    everything: bool,
-) -> bool:
-    """One spectrum, or the recordings of one condition."""
-
-    def fitted(tell: Any, answer: Any) -> Any:
-        return jm.fit(model, seen, progress=tell, answer=answer, **options)
-
-    called = seen[0].name if isinstance(seen, list) else seen.name
-    return _fit_one(fitted, called, folder, formats, everything=everything)
-
-
-def _fit_with_holds(
-    moved: Any,
-    held: Any,
-    folder: Path,
-    options: dict[str, Any],
-    formats: list[str],
-    *,
-    everything: bool,
-) -> bool:
-    """Records of a moved and of a held insertion."""
-
-    def fitted(tell: Any, answer: Any) -> Any:
-        return jm.fit_joint(
-            {"moved": moved, "held": held.target()}, progress=tell, answer=answer, **options
-        )
-
-    called = "the moved and the held record"
-    return _fit_one(fitted, called, folder, formats, everything=everything)
-
-
 def _fit_one(
-    fit: Callable[[Any, Any], Any],
+    fit: Callable[..., Any],
     called: str,
     folder: Path,
     formats: list[str],
@@ -477,7 +444,7 @@ def _fit_one(
     stays(NOTHING)
     try:
         with told(True, f"fitting {called}") as tell:
-            result = fit(tell, answer)
+            result = fit(progress=tell, answer=answer)
             tell("writing", 1.0)
             files = write_fit(result, folder, formats, report=True)
     except jm.fits.FitInterrupted as stop:
@@ -504,11 +471,10 @@ def _fit_one(
         if sentence.removeprefix("note: ") not in told_before
     ]
     for sentence in new:
-        out.print(plain(sentence), highlight=False)
+        out.print(plain(sentence))
     if new and _numbers(printed[0]) != _numbers(result):
         out.print(
             "The checks moved the last digits a little: cite the numbers in the files.",
-            highlight=False,
         )
     say_written(folder, *files)
     return result.success
