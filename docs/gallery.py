@@ -168,12 +168,6 @@ SECTIONS = (
                 "tutorial.md#4-read-it",
             ),
             Shown(
-                "gallery/schematic.png",
-                "jm.plot.schematic(result)",
-                "The model with its numbers",
-                "model.md#muscle",
-            ),
-            Shown(
                 "gallery/components.png",
                 "jm.plot.components(result)",
                 "What the power is made of",
@@ -183,12 +177,6 @@ SECTIONS = (
                 "gallery/starts.png",
                 "jm.plot.starts(result)",
                 "Did all starts end at the same minimum?",
-                "fitting.md",
-            ),
-            Shown(
-                "gallery/start_values.png",
-                "jm.plot.start_values(result)",
-                "In which parameters the starts agree",
                 "fitting.md",
             ),
             Shown(
@@ -261,12 +249,6 @@ SECTIONS = (
                 "gallery/profile.png",
                 "corner.plot()",
                 "A profile: how far one quantity can move",
-                "uncertainty.md",
-            ),
-            Shown(
-                "gallery/profiles.png",
-                'jm.plot.profiles([corner, jm.profile(result, "band_8_12")])',
-                "Several profiles",
                 "uncertainty.md",
             ),
             Shown(

@@ -37,9 +37,7 @@ def tasks() -> Figure:
     figure = plt.figure(figsize=(WIDE, 0.76 * WIDE))
     each = (jm.Isometric(), jm.PrescribedLength(), jm.PrescribedForce(), jm.PrescribedMotion())
     for i, task in enumerate(each):
-        jm.plot.schematic(
-            task, figure.add_axes((0.5 * (i % 2), 0.5 * (i < 2), 0.49, 0.49)), values=False
-        )
+        jm.plot.schematic(task, figure.add_axes((0.5 * (i % 2), 0.5 * (i < 2), 0.49, 0.49)))
     return figure
 
 

@@ -4,6 +4,7 @@ import importlib
 import os
 from pathlib import Path
 
+import jax
 import pytest
 from typer.testing import CliRunner
 
@@ -18,6 +19,18 @@ SPARING = [
 def sparing():
     """The modules that have `spare`."""
     return SPARING
+
+
+@pytest.fixture(autouse=True)
+def keep_settings(monkeypatch):
+    """Commands switch cache and precision; the tests keep theirs. Messages are not to be broken
+    into lines."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    names = ("jax_compilation_cache_dir", "jax_enable_x64")
+    before = {name: getattr(jax.config, name) for name in names}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
 
 
 @pytest.fixture(autouse=True)

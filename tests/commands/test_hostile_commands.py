@@ -4,48 +4,20 @@ elsewhere."""
 import json
 import os
 
-import jax
-import numpy as np
+import in_process
 import pytest
 import tomli_w
+from in_process import POWER, run, write_spectrum
 from test_result import made_result
-from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle._common import figures
-from jaxmuscle.commands.main import app
-
-GRID = 0.390625 * np.arange(1, 31)
-POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
-
-
-@pytest.fixture(autouse=True)
-def keep_settings(monkeypatch):
-    """Commands switch cache, precision and devices; the tests keep theirs. Messages are not to be
-    broken into lines."""
-    monkeypatch.setenv("COLUMNS", "1000")
-    jax.devices()  # from now on there can be no more of them
-    before = jax.config.jax_enable_x64
-    yield
-    jax.config.update("jax_enable_x64", before)
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, [str(a) for a in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), repr(
-        result.exception
-    )
-    assert "Traceback" not in result.output
-    return result
 
 
 def refused(result, words):
     """Exit code 2 and one sentence."""
-    assert (
-        result.exit_code == 2
-        and words in result.stderr
-        and len(result.stderr.strip().splitlines()) == 1
-    )
+    in_process.refused(result, words)
+    assert len(result.stderr.strip().splitlines()) == 1
 
 
 COMMANDS = {
@@ -121,11 +93,8 @@ def test_a_nested_result_is_no_obstacle(tmp_path, monkeypatch):
     """What an earlier fit.json says of other files, of which there may be none."""
     monkeypatch.setattr(jm, "fit", lambda *_, **__: made_result())
     (tmp_path / "fit.json").write_text(NESTED["tables.json"])
-    (tmp_path / "mine.csv").write_text(
-        "frequency_hz,proportional_power\n"
-        + "".join(f"{f},{p}\n" for f, p in zip(GRID, POWER, strict=True))
-    )
-    assert run("fit", tmp_path / "mine.csv", "--out", tmp_path, "--force").exit_code == 0
+    path = write_spectrum(tmp_path / "mine.csv")
+    assert run("fit", path, "--out", tmp_path, "--force").exit_code == 0
 
 
 @pytest.mark.parametrize("command", ["merge", "ensemble"])

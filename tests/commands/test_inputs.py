@@ -2,10 +2,10 @@
 
 import shutil
 
-import jax
 import numpy as np
 import pytest
 import typer
+from in_process import write_recording, write_spectrum
 from test_result import made_result
 from typer.testing import CliRunner
 
@@ -77,29 +77,19 @@ def test_every_command_that_writes_is_tried():
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "1000")
-    before = jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64
+def here(tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
-    frequency = 0.390625 * np.arange(1, 31)
-    rows = "".join(f"{f},{1 / (1 + f * f)}\n" for f in frequency)
-    (folder / "spectrum.csv").write_text("frequency_hz,proportional_power\n" + rows)
-    rng = np.random.default_rng(0)
-    force, x = 5 + 0.1 * rng.standard_normal(2000), rng.standard_normal(2000)
-    rows = [f"{k / 100},{force[k]:.5f}" for k in range(2000)]
-    (folder / "trial.csv").write_text("time_s,force_N\n" + "\n".join(rows))
-    rows = [f"{row},{x[k]:.5f}" for k, row in enumerate(rows)]
-    (folder / "moved.csv").write_text("time_s,force_N,x_mm\n" + "\n".join(rows))
+    write_spectrum(folder / "spectrum.csv")
+    write_recording(folder / "trial.csv")
+    write_recording(folder / "moved.csv", x_mm=np.random.default_rng(1).standard_normal(2000))
     (folder / "groups.csv").write_text(
         "target,group\nfdi-abduction-45mvc,a\nvastus-lateralis-26mvc,b\n"
     )
     (folder / "study.csv").write_text(f"file,person\n{folder}/trial.csv,a\n{folder}/moved.csv,b\n")
     jm.Isometric().save(folder / "preset.toml")
     made_result().save(folder / "fit.json")
-    yield folder
-    jax.config.update("jax_compilation_cache_dir", before[0])
-    jax.config.update("jax_enable_x64", before[1])
+    return folder
 
 
 def run(words, folder, path, out):

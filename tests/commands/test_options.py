@@ -7,10 +7,9 @@ import typing
 from pathlib import Path
 from typing import Any
 
-import jax
-import numpy as np
 import pytest
 import typer.testing
+from in_process import write_recording, write_spectrum
 from typer.testing import CliRunner
 
 from jaxmuscle._common import programs
@@ -69,21 +68,13 @@ def here(tmp_path, monkeypatch):
     # Typer would build all commands with their options for every call, which takes longer than the
     # call.
     monkeypatch.setattr(typer.testing, "_get_command", lambda app: MADE, raising=False)
-    monkeypatch.setenv("COLUMNS", "1000")
     monkeypatch.chdir(tmp_path)
-    frequency = 0.390625 * np.arange(1, 31)
-    rows = "".join(f"{f},{1 / (1 + f * f)}\n" for f in frequency)
-    (tmp_path / "t.csv").write_text("frequency_hz,proportional_power\n" + rows)
-    force = 5 + 0.1 * np.random.default_rng(0).standard_normal(3000)
+    write_spectrum(tmp_path / "t.csv")
     for name in ("r.csv", "r2.csv"):
-        (tmp_path / name).write_text(
-            "time_s,force_N\n" + "".join(f"{k / 100},{x}\n" for k, x in enumerate(force))
-        )
+        write_recording(tmp_path / name, samples=3000)
     (tmp_path / "s.csv").write_text("file,person\nr.csv,a\nr2.csv,b\n")
     (tmp_path / "folder").mkdir()
-    before = jax.config.jax_enable_x64
-    yield tmp_path
-    jax.config.update("jax_enable_x64", before)
+    return tmp_path
 
 
 def kind_of(parameter: inspect.Parameter) -> Any:

@@ -7,48 +7,21 @@ import os
 import subprocess
 import sys
 
-import jax
-import numpy as np
 import pytest
 import tomli_w
+from in_process import POWER, run
 from processes import ended, environment, python
 from test_result import made_result
-from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle._common.tables import FORMULAS
-from jaxmuscle.commands.main import app
 
-GRID = 0.390625 * np.arange(1, 31)
-POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
 SHELL = pytest.mark.skipif(os.name != "posix", reason="of a shell")
 FULL = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="of Linux")
 
 
-@pytest.fixture(autouse=True)
-def keep_settings(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "1000")
-    before = jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64
-    yield
-    jax.config.update("jax_compilation_cache_dir", before[0])
-    jax.config.update("jax_enable_x64", before[1])
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, [str(a) for a in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), repr(
-        result.exception
-    )
-    return result
-
-
 def recording(folder, name="trial.csv"):
-    force = 5 + 0.1 * np.random.default_rng(sum(name.encode())).standard_normal(2000)
-    path = folder / name
-    path.write_text(
-        "time_s,force_N\n" + "".join(f"{k / 100},{x:.5f}\n" for k, x in enumerate(force))
-    )
-    return path
+    return write_recording(folder / name, seed=sum(name.encode()))
 
 
 # --- streams

@@ -4,6 +4,7 @@ printed."""
 import numpy as np
 import pandas
 import pytest
+from in_process import run
 from test_study import made_study
 from typer.testing import CliRunner
 
@@ -23,11 +24,7 @@ def table(tmp_path):
 
 
 def command(*arguments):
-    result = CliRunner().invoke(app, ["study", *map(str, arguments)], env={"COLUMNS": "300"})
-    assert result.exception is None or isinstance(result.exception, SystemExit), repr(
-        result.exception
-    )
-    return result
+    return run("study", *arguments)
 
 
 @pytest.mark.parametrize(

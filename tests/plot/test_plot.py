@@ -16,10 +16,8 @@ from jaxmuscle import plot
 from jaxmuscle._common.figures import pixels_of, write_figure
 from jaxmuscle.checks._bootstrap import Bootstrap, Recovery
 from jaxmuscle.data._target import Target, load_target
-from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._tasks import Isometric, PrescribedForce, PrescribedLength, PrescribedMotion
-from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.plot import _fit as _plot_fit
 from jaxmuscle.plot import _numbers as _plot_numbers
 from jaxmuscle.plot import _steadiness as _plot_steadiness
@@ -622,22 +620,6 @@ def test_starts_are_drawn_in_the_order_of_where_they_ended():
     assert not plot.starts(Fake(starts=())).lines
 
 
-def test_end_values_of_starts_are_drawn_over_those_of_the_best():
-    ended = [(9.0, (4.0, 1.0, 3.0)), (4.0, (2.0, -1.0, 3.0)), (None, ()), (4.5, (1.0, 0.5, 6.0))]
-    starts = tuple(Fake(cost=c, success=True, values=v) for c, v in ended)
-    ax = plot.start_values(Fake(starts=starts, settings={"free": ["k_w", "x_z", "c_w"]}))
-    drawn = [line.get_xydata().tolist() for line in ax.lines]  # the best last, above the others
-    assert drawn == [[[2, 0], [1, 1]], [[0.5, 0], [2, 1]], [[1, 0], [1, 1]]]
-    # a negative value has no logarithm
-    assert [tick.get_text() for tick in ax.get_yticklabels()] == ["k_w", "c_w"]
-    assert ax.get_xscale() == "log" and ax.lines[-1].get_color() == "black"
-    bar = ax.figure.axes[1]
-    assert bar.get_ylabel() == "Rise of χ²" and bar.get_ylim() == pytest.approx((0.0, 10.0))
-    assert ax.lines[0].get_color() == plt.get_cmap("viridis")(1.0)
-    with pytest.raises(ValueError, match="saved by an earlier version"):
-        plot.start_values(Fake(starts=(), settings={"free": []}))
-
-
 @pytest.mark.parametrize("log", [True, False])
 def test_components_add_up_to_the_fit(log):
     found = result(components=tremor())
@@ -857,8 +839,7 @@ def designed():
 
 
 def identified():
-    """A report of the bundled measurements, two of them together; two directions now are far too
-    small to be drawn."""
+    """A report of the bundled measurements; two directions now are far too small to be drawn."""
     told = [
         "harmonic_frequency",
         "K_w0",
@@ -885,10 +866,8 @@ def identified():
         target="vastus-lateralis-26mvc",
         designs=designs,
         present=outlook("now", 1.0),
-        together=" and ",
         names=told,
         open_in_fit=(),
-        telling_pairs=[outlook(f"{names[0]} and {names[1]}", 1e9)],
         letter=lambda i: "ABC"[i],
         threshold=3.0,
         doubt="The fit does not describe its data",
@@ -1029,9 +1008,9 @@ def test_small_singular_values_are_counted_and_the_legend_says_so():
     upper = figure.axes[0]
     assert key(figure) == ["determined", "not determined", "how many below 0.01"]
     counts = [text.get_text() for text in upper.texts if text.get_text().isdigit()]
-    assert counts == ["2", "2", "2", "2"]  # with two measurements together none is too small
+    assert counts == ["2", "2", "2", "2"]
     shares = [text.get_text() for text in upper.texts if text.get_text().endswith(" of 7")]
-    assert shares == ["3 of 7", "3 of 7", "4 of 7", "4 of 7", "6 of 7"]
+    assert shares == ["3 of 7", "3 of 7", "4 of 7", "4 of 7"]
 
 
 @pytest.mark.parametrize("style", ["default", "dark_background"])
@@ -1127,42 +1106,6 @@ def test_a_bootstrap_draws_the_coverage_of_its_own_intervals():
     assert share(ax, "corner frequency", 0.95) == near / known
 
 
-def test_several_profiles_share_a_figure_and_a_legend():
-    values = np.linspace(0.5, 1.5, 21)
-    common = {
-        "threshold": 3.84,
-        "level": 0.95,
-        "intervals": [(0.8, 1.2)],
-        "value": 1.0,
-        "stderr": 0.1,
-        "unit": "Hz",
-        "target": "mine",
-        "low": 0.8,
-        "high": 1.2,
-    }
-    each = [
-        Fake(values=values, rise=k * (values - 1) ** 2, name=f"n{k}", **common)
-        for k in (100, 50, 25, 12)
-    ]
-    figure = plot.profiles(each)
-    figure.canvas.draw()
-    assert [ax.get_xlabel() for ax in figure.axes] == [
-        "n100 (Hz)",
-        "n50 (Hz)",
-        "n25 (Hz)",
-        "n12 (Hz)",
-    ]
-    assert all(ax.get_ylabel() for ax in figure.axes)
-    assert (
-        key(figure) == ["profile", "95 % threshold", "95 % interval", "by curvature"]
-        and figure.get_suptitle() == "mine"
-    )
-    for ax, found in zip(figure.axes, each, strict=True):
-        np.testing.assert_array_equal(named(ax, "profile").get_ydata(), found.rise)
-    with pytest.raises(ValueError, match="profiles: is empty"):
-        plot.profiles([])
-
-
 # --- figures as files
 
 
@@ -1225,7 +1168,7 @@ def written(ax):
 )
 def test_the_drawing_tells_what_a_task_prescribes_and_what_comes_out(task, given, output):
     symbols = {"P_w": r"$P_\mathrm{w}$", "F_ext": r"$F_\mathrm{ext}$", "x_z": r"$x_\mathrm{z}$"}
-    words = written(plot.schematic(task, values=False))
+    words = written(plot.schematic(task))
     assert {name for name, symbol in symbols.items() if symbol in words[plot.BLUE]} == given
     assert [name for name, symbol in symbols.items() if symbol in words[plot.VERMILLION]] == [
         output
@@ -1235,65 +1178,20 @@ def test_the_drawing_tells_what_a_task_prescribes_and_what_comes_out(task, given
     assert ("M" in words[plot.BLUE]) == ("x_z" in given and not held)
 
 
-def test_the_drawing_has_the_numbers_of_the_task():
-    task = PrescribedForce(
-        P_w=7.0, F_ext=2.5, noise=BandLimitedNoise() + ResonantNoise(0.01, frequency=9.0)
-    ).replace(m_w=0.25, k_w=1e6, c_z=8.0, noise_C_w=0.0, activation_time=0.08)
-    said = [text.get_text() for text in plot.schematic(task).texts]
-    for words in (
-        ("K_", "400 N/m"),
-        ("C_", "8 N s/m"),
-        ("P_", "7 N"),
-        ("noise 15 %",),
-        ("resonance 1 % at 9 Hz",),
-        ("twitch of 0.08 s",),
-    ):
-        assert any(all(word in text for word in words) for text in said), words
-    assert {"0.25 kg", "0.5 kg", "2.5 N"} <= set(said) and said.count("noise 0.01 %") == 1
-    assert any("sine 0.3 % at 4.25 Hz" in text for text in said)
-    assert not any(
-        "sine" in text.get_text()
-        for text in plot.schematic(task.replace(harmonic_amplitude=0.0)).texts
-    )
+def test_arrows_are_upon_what_fluctuates():
+    def arrows(task):
+        ax = plot.schematic(task)
+        return sum(
+            text.arrow_patch is not None
+            and text.arrow_patch.get_edgecolor()[:3] == to_rgb(plot.ORANGE)
+            for text in ax.texts
+        )
+
+    assert arrows(Isometric()) == 4 and arrows(Isometric().replace(noise_C_w=0.0)) == 3
 
 
-def drawn_fit(**changes):
-    """A fit as far as its drawing reads it."""
-    derived = {
-        "K_w0": estimate(184.2, "N/m", 13.0),
-        "K_z0": estimate(314.0, "N/m", identifiable=False),
-        "C_w0": estimate(114.3, "N s/m", 8.0),
-        "C_z0": estimate(1.79, "N s/m", 0.12),
-        "model_mean": estimate(2.92, "N", 0.2),
-    } | changes
-    parameters = {
-        "noise_K_w": estimate(0.269, "1", 0.019),
-        "harmonic_amplitude": estimate(0.00325, "1", 0.00023),
-    }
-    return Fake(tasks={"a": Isometric()}, parameters=parameters, derived=derived, as_shown=dict)
-
-
-def test_the_drawing_of_a_fit_has_errors_and_marks_what_is_not_determined():
-    ax = plot.schematic(drawn_fit())
-    said = [text.get_text() for text in ax.texts]
-    assert any("184 ± 13 N/m" in text for text in said) and "noise 26.9 ± 1.9 %" in said
-    assert [text for text in said if "†" in text] == [
-        r"$K_\mathrm{z0}$  314 N/m †",
-        "† not determined by the data",
-    ]
-    assert {"2.92", "± 0.20 N"} <= set(said)
-    known = plot.schematic(drawn_fit(K_z0=estimate(314.0, "N/m", 22.0)))
-    assert not any("†" in text.get_text() for text in known.texts)
-
-
-def test_the_drawing_of_a_joint_fit_asks_for_one_of_its_tasks():
-    with pytest.raises(ValueError, match=r"result.tasks\['a'\]"):
-        plot.schematic(Fake(tasks={"a": Isometric(), "b": Isometric()}))
-
-
-@pytest.mark.parametrize("values", [True, False])
-def test_words_of_the_drawing_lie_in_a_column_of_a_journal_and_do_not_touch(values):
-    figure = plot.schematic(drawn_fit(K_z0=estimate(314.0, "N/m", 22.0)), values=values).figure
+def test_words_of_the_drawing_lie_in_a_column_of_a_journal_and_do_not_touch():
+    figure = plot.schematic(Isometric()).figure
     assert figure.get_figwidth() * 25.4 == pytest.approx(85)
     # a symbol stands closer to its number than lines of a text
     assert small_words(figure, 0.6) == ([], [], [])

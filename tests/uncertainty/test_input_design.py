@@ -22,7 +22,7 @@ from jaxmuscle.data import FrequencyResponse
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._problem import FitProblem
-from jaxmuscle.uncertainty import Lengthening, _input_design
+from jaxmuscle.uncertainty import Lengthening
 from jaxmuscle.uncertainty._design_information import (
     design_information,
     expansion_at,
@@ -30,8 +30,8 @@ from jaxmuscle.uncertainty._design_information import (
     with_open_masses,
 )
 from jaxmuscle.uncertainty._identifiability import fitted_problem
-from jaxmuscle.uncertainty._identifiability_report import TOGETHER
 from jaxmuscle.uncertainty._input_design import Experiment, _full_name, steps_of
+from jaxmuscle.uncertainty._multisine import Motion
 
 BASE = ("k_w", "k_z", "c_w", "c_z")
 TANGENTS = ("K_w_tangent", "tangent_stiffness")
@@ -117,7 +117,7 @@ def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
     """By hand: H also has m_z s², and slopes by m_w; of both ln masses the prior is known, and then
     they are left out."""
     problem, theta = fitted_problem(hold(), None)
-    told, problem, theta = problem, with_open_masses(problem), np.append(theta, [0.0, 0.0])
+    problem, theta = with_open_masses(problem), np.append(theta, [0.0, 0.0])
     lengthening = FLAT
     design = jm.uncertainty.Design("moved", PULLED, segments=0, lengthening=FLAT)
     found = design_information(problem, theta, design)
@@ -145,24 +145,6 @@ def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
         found / np.outer(size, size), expected / np.outer(size, size), atol=1e-5
     )
     assert expected[1, 1] < 0.9 * whole[1, 1]  # known masses would tell more of K_z0
-    assert "m_w and m_z fitted in this measurement" in design.describe(told)[1]
-
-
-def test_two_moved_records_know_of_the_masses_once():
-    """A record twice is one of twice the mean square: the prior of the masses counts once in
-    both."""
-    once = FLAT
-    twice = Lengthening(once.frequency, 2 * once.power, SECONDS)
-    moved = {
-        name: jm.uncertainty.Design(name, TRUTH, segments=0, lengthening=given)
-        for name, given in (("a", once), ("b", once), ("both", twice))
-    }
-    report = jm.identifiability(hold(), designs=moved.values())
-    pair = next(pair for pair in report.pairs if pair.name == "a" + TOGETHER + "b")
-    single = report.designs[-1]
-    for name, known in single.quantities.items():
-        assert pair.quantities[name].stderr == pytest.approx(known.stderr, rel=1e-3), name
-    assert single.singular_values == pytest.approx(pair.singular_values, rel=1e-3, abs=1e-2)
 
 
 def test_what_follows_from_the_spectrum_depends_on_the_masses_too(x64):
@@ -229,27 +211,6 @@ def test_a_mass_that_a_moved_record_was_fitted_with_is_known(x64):
         and with_open_masses(other) is other
     )
     assert with_open_masses(problem).coordinates.names == (*problem.coordinates.names, "m_w", "m_z")
-    design = jm.uncertainty.Design("pulled", TRUTH, segments=0, lengthening=moved, target="hold")
-    assert "(m_z fitted in this measurement)" in design.describe(both)[1]
-
-
-def test_what_a_record_tells_if_the_muscle_is_another_one():
-    """The prior of a task is independent of all else: a standard error up multiplies k_w by exp of
-    its prior's, no more."""
-    task = PULLED
-    given = {"seconds": SECONDS, "band": BAND, "rate": 50.0}
-    made = jm.uncertainty.design_input(task, "K_w0", **given)
-    factor = np.exp(made.now["K_w0"] / made.values["K_w0"])
-    (low, below), (high, above) = made.elsewhere["K_w0"]
-    assert high / made.values["K_w0"] == pytest.approx(factor, rel=1e-6)
-    assert made.values["K_w0"] / low == pytest.approx(factor, rel=1e-6)
-    for times, error in ((1 / factor, below), (factor, above)):
-        other = task.replace(k_w=float(task["k_w"]) * times)
-        with jax.enable_x64(True):
-            known = Experiment.of(other, ("K_w0",), made.even, None).errors(made.lengthening.power)
-        assert error == pytest.approx(known["K_w0"], rel=1e-6)
-    assert f"K_w0 may well be {low:.3g} N/m or {high:.3g} N/m instead of" in in_a_line(made)
-    assert made.to_dict()["elsewhere"]["K_w0"][0] == {"value": low, "stderr": below}
 
 
 def estimates(displacement, rate, lines, seed):
@@ -279,13 +240,9 @@ def hold():
 
 @functools.cache
 def designed(**given):
-    """Without what it would tell of another muscle, which takes half of the time and has a test of
-    its own."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_input_design, "_elsewhere", lambda *_: (np.nan, np.nan))
-        return jm.uncertainty.design_input(
-            hold(), **({"seconds": SECONDS, "band": BAND, "rate": 50.0} | given)
-        )
+    return jm.uncertainty.design_input(
+        hold(), **({"seconds": SECONDS, "band": BAND, "rate": 50.0} | given)
+    )
 
 
 def test_repeats_scatter_as_said_and_the_designed_motion_beats_the_flat_one():
@@ -305,7 +262,7 @@ def test_repeats_scatter_as_said_and_the_designed_motion_beats_the_flat_one():
         np.testing.assert_allclose(
             lengthening.of_motion(motion).power, lengthening.power, rtol=1e-9
         )
-        found = estimates(motion, made.rate, made.frequency, 7)
+        found = estimates(motion, made.asked.rate, made.frequency, 7)
         expected = np.linalg.inv(information(lengthening))
         spread[name] = np.var(found[:, 0], ddof=1)
         low, high = scipy.stats.chi2.ppf([DOUBTFUL / 16, 1 - DOUBTFUL / 16], REPEATS - 1) / (
@@ -424,64 +381,27 @@ def test_a_flat_motion_is_drawn_and_called_once(tmp_path):
         )
 
 
-def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
-    """A record of twice the length, designed as such, has the errors told for it; at the length
-    needed they are as wanted.
-
-    The other design has other lines and phases, and a little more than twice the Welch segments:
-    equal to a tenth.
-    """
-    made = designed(durations=(SECONDS, 2 * SECONDS), error=0.04)
-    assert made.by_seconds[SECONDS] == pytest.approx(made.stderr, rel=1e-9)
-    twice = designed(seconds=2 * SECONDS)
-    for name in BASES:
-        assert made.by_seconds[2 * SECONDS][name] == pytest.approx(twice.stderr[name], rel=0.1)
+def test_the_wanted_error_says_how_long_to_record():
+    """At the length needed the errors are as wanted."""
+    made = designed(error=0.04)
     assert made.needed is not None and made.needed[0] == 0.04
-    found = designed(durations=(made.needed[1],))
-    assert found.by_seconds[made.needed[1]]["K_w0"] / found.values["K_w0"] == pytest.approx(
-        0.04, rel=1e-6
-    )
+    errors = experiment(("K_w0",)).errors(made.lengthening.power, made.needed[1] / SECONDS)
+    assert errors["K_w0"] / made.values["K_w0"] == pytest.approx(0.04, rel=1e-6)
     assert (
         f"to know K_w0 to 4 % (standard error), {made.needed[1]:.3g} s of record are enough"
         in in_a_line(made)
     )
-    assert "for records of other lengths" in str(made) and "of other lengths" not in str(designed())
-    assert "no length of the record" in str(designed(error=1e-9))
+    assert "no record that a person holds tells K_w0" in in_a_line(designed(error=1e-9))
+    assert "no record that a person holds" in in_a_line(designed(rms=1e-4, error=0.04))
     assert (
         made.to_dict()["needed"]["seconds"] == made.needed[1]
         and designed(error=1e-9).to_dict()["needed"]["seconds"] is None
     )
     assert "what is known without this record is enough" in in_a_line(designed(error=0.999))
-    small = in_a_line(designed(rms=1e-4, error=0.04))
-    assert re.search(
-        r"to 4 % \(standard error\), a record of \S+ hours would be needed, which nobody holds",
-        small,
-    )
-    assert "less than 1 s of this motion would tell that. Play one period" in in_a_line(
-        designed(rms=0.1, error=0.1)
-    )
     with pytest.raises(ValueError, match="give at least 8 s"):
         designed(seconds=1.0)
-    with pytest.raises(ValueError, match="durations"):
-        designed(durations=(0.0,))
     with pytest.raises(ValueError, match="error"):
         designed(error=-0.1)
-
-
-def test_a_wider_band_is_told_of_where_it_tells_more():
-    """As another design says, whose band it is and which is flat."""
-    made = designed(band=(0.1, 1.0))
-    other = designed(band=(0.1, 2.0), spread=1.0)
-    assert made.wider is not None and made.wider[0] == 2.0
-    assert made.wider[1] == pytest.approx(other.flat, rel=1e-6)
-    told = (
-        made.flat["K_w0"] > 1.3 * other.flat["K_w0"]
-        and made.stderr["K_w0"] > 0.05 * made.values["K_w0"]
-    )
-    assert ("design again with --band 0.1:2 (band=(0.1, 2))" in in_a_line(made)) == told
-    assert designed(band=(0.1, 20.0)).wider is None  # beyond half of the rate
-    slow = designed(band=(0.1, 1.0), speed=1e-3).wider
-    assert slow is not None and slow[1]["K_w0"] > made.wider[1]["K_w0"]
 
 
 def test_a_quantity_of_several_targets_has_its_plain_name():
@@ -522,7 +442,7 @@ def test_the_standard_designs_know_what_a_flat_motion_tells():
     designs = [d for d in jm.uncertainty.standard_designs(hold()) if d.lengthening is not None]
     report = jm.identifiability(hold(), designs=designs)
     assert [d.name for d in report.designs] == MOVED
-    usual = inspect.signature(jm.uncertainty.design_input).parameters["band"].default
+    usual = Motion().band
     bands = [(d.lengthening.frequency[0], d.lengthening.frequency[-1]) for d in designs]
     assert bands == [(0.5, 10.0), pytest.approx(usual)] and usual[0] == 0.5
     (small, large), made = report.designs, designed(band=usual)
@@ -530,11 +450,7 @@ def test_the_standard_designs_know_what_a_flat_motion_tells():
     for name in BASES:
         assert large.quantities[name].stderr == pytest.approx(made.flat[name], rel=1e-6)
         assert small.quantities[name].stderr > large.quantities[name].stderr
-    assert large.task == "PrescribedLength (insertion moved by a motor, force measured), P_w = 5 N"
-    assert large.data.endswith(
-        "response to a lengthening of 1 mm rms, 0.5 to 5 Hz, for 60 s (m_w and m_z fitted in this"
-        " measurement)"
-    )
+    assert all(design.masses_open for design in report.designs) and not report.present.masses_open
 
 
 def test_a_measured_stiffness_with_these_errors_tells_the_same(x64):
@@ -586,10 +502,7 @@ def test_the_default_band_begins_where_the_page_advises():
     advised = re.search(
         r"^\| band \| ([\d.]+) to", (pages.ROOT / "docs" / "perturbed.md").read_text(), re.MULTILINE
     )
-    here, shell = (
-        inspect.signature(made).parameters["band"].default
-        for made in (jm.uncertainty.design_input, design)
-    )
+    here, shell = Motion().band, inspect.signature(design).parameters["band"].default
     assert advised is not None and float(advised[1]) == here[0]
     assert shell == f"{here[0]:g}:{here[1]:g}"
 
@@ -643,10 +556,10 @@ def test_the_figure():
     [
         ({"quantity": "K_w"}, "quantity 'K_w' is unknown: did you mean 'k_w'"),
         ({"quantity": "x_ref_w"}, "quantity 'x_ref_w' is fixed: leave its parameter free"),
-        ({"rms": 0.0}, r"rms = 0.0 m must be a positive number"),
-        ({"peak": -1e-3}, r"peak = -0.001 m must be a positive number"),
-        ({"speed": 0.0}, "speed = 0.0 m/s must be a positive number"),
-        ({"acceleration": -1.0}, "acceleration = -1.0 m/s² must be a positive number"),
+        ({"rms": 0.0}, "rms = 0.0: give a finite number above 0"),
+        ({"peak": -1e-3}, "peak = -0.001: give a finite number above 0"),
+        ({"speed": 0.0}, "speed = 0.0: give a finite number above 0"),
+        ({"acceleration": -1.0}, "acceleration = -1.0: give a finite number above 0"),
         ({"band": (0.0, 5.0)}, r"band = \(0, 5\) Hz must lie above 0 Hz"),
         ({"band": (5.0, 1.0)}, r"band = \(5, 1\) Hz must lie above 0 Hz"),
         ({"band": (0.1, 26.0)}, r"band = \(0.1, 26.0\) Hz reaches beyond half of rate = 50.0 Hz"),
@@ -668,3 +581,8 @@ def test_a_motor_needs_an_insertion_to_move():
         ValueError, match="moved: lengthening: in PrescribedForce no motor moves the insertion"
     ):
         jm.identifiability(fitted(segments=SEGMENTS), designs=[design])
+
+
+def test_an_unknown_option_is_refused():
+    with pytest.raises(TypeError, match=r"design_input\(\) has no option 'lenght'.*seconds"):
+        jm.uncertainty.design_input(TRUTH, lenght=1.0)

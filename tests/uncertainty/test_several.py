@@ -237,10 +237,9 @@ def test_the_posterior_of_two_targets(tmp_path, monkeypatch):
         )
         assert summary[name]["sd"] == pytest.approx(joint.parameters[name].stderr, rel=0.35)
     for name in TASKS:
-        task = found.task_of(1, 7, name)
-        assert float(task["c_w"]) == found.samples["c_w"][1, 7] and float(task["P_w"]) == float(
-            TASKS[name]["P_w"]
-        )
+        task = found.parts[name].task
+        assert float(task["c_w"]) == pytest.approx(summary["c_w"]["median"])
+        assert float(task["P_w"]) == float(TASKS[name]["P_w"])
         assert 0.01 < found.parts[name].replicates.p_value < 0.99
         plt.close(found.plot_predictive(target=name).figure)
     with pytest.raises(AttributeError, match=r"posterior\.parts\['low'\]"):

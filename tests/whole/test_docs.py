@@ -74,6 +74,9 @@ FIGURES = [
 EVERYWHERE = {"ax", "seed", "settings", "target", "task", "versions"}
 
 
+OPTIONS_SAID = (jm.fit, jm.profile, jm.posterior, jm.uncertainty.design_input)
+
+
 def described(thing):
     """The words of a docstring, of a class also those of its public bases."""
     family = (
@@ -92,8 +95,12 @@ def test_public_object_is_documented(name):
     if not inspect.isclass(thing):
         parameters = inspect.signature(thing).parameters
         given = {name for name in parameters if name != "options"}
-        if "options" in parameters and thing is jm.fit:  # others say that theirs are the same
+        # others say that theirs are the same
+        if "options" in parameters and thing is jm.fit:
             given |= OneFitOptions.__optional_keys__ | JointFitOptions.__optional_keys__
+        elif "options" in parameters and thing in OPTIONS_SAID:
+            (options,) = typing.get_args(parameters["options"].annotation)
+            given |= options.__optional_keys__
         source = inspect.getsource(thing)
         assert "raise " not in source or "aises" in (inspect.getdoc(thing) or "")
     elif dataclasses.is_dataclass(thing):

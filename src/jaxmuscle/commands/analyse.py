@@ -9,13 +9,13 @@ from .console import (
     SPECTRUM,
     absent,
     csv_text,
-    err,
     keep_other_spectrum,
     out,
     plain,
     plain_lines,
     record,
     reporting,
+    say_notice,
     say_written,
     spare,
     writable,
@@ -211,7 +211,7 @@ def _write(
         if target is None
         else target.notices
     ):
-        err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
+        say_notice(notice)
     table = Table(
         title=plain(trials.name if several else trials[0].source),
         title_justify="left",
@@ -231,10 +231,9 @@ def _write(
             "Maxima are interpolated between bins. Local maxima are listed if they rise by at least"
             " 1 % of the highest power; they may be chance. A tremor is mostly smaller: jaxmuscle"
             " steadiness looks for its peak.",
-            highlight=False,
         )
     if whole:
-        out.print(plain_lines(target), highlight=False)
+        out.print(plain_lines(target))
     written = ["analysis.json", "spectrum.csv", *figures]
     if target is not None and save_target is not None:
         save_target.parent.mkdir(parents=True, exist_ok=True)
@@ -271,10 +270,10 @@ def _write_perturbed(
         },
     }
     write_json(folder / "analysis.json", found)
-    out.print(plain_lines(recording), highlight=False)
+    out.print(plain_lines(recording))
     for line in str(response).splitlines():
         if line.startswith(("  gain", "  phase", "  coherence")):
-            out.print(plain(line), highlight=False)
+            out.print(plain(line))
     title = "Spring K, damper B, mass I:\nH = K + iωB - ω²I\n(the delay is of a second fit)"
     table = Table(title=title, title_justify="left", show_header=False)
     for name, (value, error, unit) in classical.items():
@@ -290,13 +289,12 @@ def _write_perturbed(
     out.print(table)
     late = recording.late(settings)
     for notice in late:
-        err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
+        say_notice(notice)
     if misfit > MISSED and not late:
         out.print(
             "A spring, a damper and a mass do not describe these points: their chi2 is"
             f" {misfit:.2g} times what it should be. Do not interpret K, B and I. Fit a muscle:"
             " jaxmuscle fit FILE --task prescribed-length",
-            highlight=False,
         )
     record(found)
     say_written(folder, "analysis.json", "response.csv", *figures)

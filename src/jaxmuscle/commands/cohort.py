@@ -20,11 +20,12 @@ from .console import (
     NOT_CONVERGED,
     REACHED,
     csv_text,
-    err,
     fit_files,
     out,
     plain,
     record,
+    say_failure,
+    say_notice,
     say_written,
     writable,
     write_fit,
@@ -190,24 +191,19 @@ def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None
         chi2 = f"[bold red]{chi2}*[/]" if result.adequate is False else chi2
         table.add_row(plain(name), *cells, chi2 if result.success else "[bold red]failed[/]")
     out.print(table)
-    out.print(f"{CHI2}. * the model does not describe the data", highlight=False)
-    out.print(plain(cohort.verdict), highlight=False)
+    out.print(f"{CHI2}. * the model does not describe the data")
+    out.print(plain(cohort.verdict))
     for d in cohort.differences():
         unit = "" if d.unit == "1" else f" {d.unit}"
         out.print(
             f"{plain(d.quantity)}: {plain(d.b)} - {plain(d.a)} = {d.difference:.3g}{unit} "
             f"(95 %: {d.low:.3g} to {d.high:.3g})",
-            highlight=False,
         )
     for name, why in cohort.failed.items():
-        err.print(f"[bold red]not fitted:[/] {plain(name)}: {plain(why)}", highlight=False)
+        say_failure(f"{name}: {why}", "not fitted")
     for name in cohort.results:
         if places[name].name != name:
-            words = (
-                f"{plain(name)}: cannot be the name of a folder here; its fit is in"
-                f" {plain(places[name])}"
-            )
-            err.print(f"[yellow]notice:[/] {words}", highlight=False)
+            say_notice(f"{name}: cannot be the name of a folder here; its fit is in {places[name]}")
     say_written(folder, "cohort.csv", f"{REPORT} and a folder for each target")
 
 

@@ -158,8 +158,6 @@ def _unsettled(found: "Comparison") -> str:
 
 
 def _show(found: "Comparison") -> None:
-    out.print(plain_lines(found), highlight=False, soft_wrap=True)
+    out.print(plain_lines(found), soft_wrap=True)
     if not found.success:
-        out.print(
-            f"[bold red]failed:[/] {plain(_unsettled(found))}", highlight=False, soft_wrap=True
-        )
+        out.print(f"[bold red]failed:[/] {plain(_unsettled(found))}", soft_wrap=True)

@@ -31,8 +31,19 @@ if TYPE_CHECKING:
 CONVERGED, NOT_CONVERGED = 0, 1
 REACHED = "reached.toml"
 
-out = Console(soft_wrap=False)
-err = Console(stderr=True, soft_wrap=not sys.stderr.isatty())  # a message is one line of a log
+out = Console(soft_wrap=False, highlight=False)
+# a message is one line of a log
+err = Console(stderr=True, soft_wrap=not sys.stderr.isatty(), highlight=False)
+
+
+def say_notice(text: object) -> None:
+    """Say what people should know beside the result."""
+    err.print(f"[yellow]notice:[/] {plain(text)}")
+
+
+def say_failure(text: object, what: str = "failed") -> None:
+    """Say in red what failed, and why."""
+    err.print(f"[bold red]{what}:[/] {plain(text)}")
 
 
 def task_of(preset: str, task: TaskName | None, observe: Observed | None = None) -> Any:
@@ -64,7 +75,7 @@ def aim_of(name: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any,
 def aimed(target: Any, task: TaskName | None) -> tuple[Any, Any]:
     """The target, its notices said, and the task to fit to it."""
     for notice in target.notices:
-        err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
+        say_notice(notice)
     return target, target.task(None if task is None else jm.model.TASKS[task])
 
 
@@ -81,10 +92,10 @@ def reporting(as_json: bool = False) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
-        err.print(f"[bold red]error:[/] {plain(_words(error))}", highlight=False)
+        say_failure(_words(error), "error")
         raise typer.Exit(BAD_INPUT) from None
     except SimulationError as error:
-        err.print(f"[bold red]failed:[/] {plain(error)}", highlight=False)
+        say_failure(error)
         raise typer.Exit(NOT_CONVERGED) from None
     except KeyboardInterrupt:
         err.print("interrupted")
@@ -142,18 +153,14 @@ def plain_lines(text: object) -> str:
 
 def say_written(folder: Path, *names: str) -> None:
     """Say which files a command has put into its folder."""
-    out.print(
-        f"Written: {plain(folder)}/{', '.join(map(plain, names))}", highlight=False, soft_wrap=True
-    )
+    out.print(f"Written: {plain(folder)}/{', '.join(map(plain, names))}", soft_wrap=True)
 
 
 def show(result: object, *, success: bool) -> None:
     """A result as it prints itself, its first line in colour."""
     first, *rest = str(result).splitlines()
-    out.print(
-        f"[{'green' if success else 'bold red'}]{plain(first)}[/]", highlight=False, soft_wrap=True
-    )
-    out.print("\n".join(map(plain, rest)), highlight=False, soft_wrap=True)
+    out.print(f"[{'green' if success else 'bold red'}]{plain(first)}[/]", soft_wrap=True)
+    out.print("\n".join(map(plain, rest)), soft_wrap=True)
 
 
 SPECTRUM = "spectrum.csv"  # of several commands
@@ -235,11 +242,7 @@ def keep_other_spectrum(folder: Path, columns: Iterable[str]) -> None:
             name for n in numbers if not (name := folder / f"spectrum-other{n}.csv").exists()
         )
         path.rename(kept)
-        err.print(
-            f"[yellow]notice:[/] {plain(path)} was there, from another command. It is kept as"
-            f" {plain(kept)}.",
-            highlight=False,
-        )
+        say_notice(f"{path} was there, from another command. It is kept as {kept}.")
 
 
 def csv_text(columns: dict[str, Any]) -> str:
@@ -289,10 +292,7 @@ def fit_into(
         err.print(f"the fit is not finished; what it had reached is in {plain(folder)}/fit.json")
         raise
     if not result.success:
-        err.print(
-            f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}",
-            highlight=False,
-        )
+        say_failure(f"the fit did not converge: {result.message}")
         raise typer.Exit(NOT_CONVERGED)
     if fit_unless_taken_up(folder, target):
         result.save(folder / "fit.json")

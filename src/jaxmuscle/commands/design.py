@@ -10,6 +10,23 @@ import jaxmuscle as jm
 from .console import out, plain_lines, record, reporting, say_written, writable
 from .options import Force, Formats, Json, Output, Seed, band_of, formats_of, names_in
 
+HOW_TO_RECORD = (
+    "- Play the motion for {played:g} s: motor.csv holds one period of {period:g} s, to be repeated"
+    " without a gap. Its first lines, which begin with #, say what it is. Let the motor move to its"
+    " first value slowly. Its largest acceleration is {acceleration:.2g} m/s². If that is too much"
+    " for your motor, design again and say how much it can do (--acceleration). If the person"
+    " tires, record several shorter trials instead.",
+    "- Record force and displacement. Fit both channels from {begin:g} to {end:g} s, together with"
+    " what you have already: the errors above include that. Give each held trial with --hold, and"
+    " an earlier moved record as a second file. In --window, give the window of the new record"
+    " first, then one auto for each other file. For three held trials that is --window"
+    " {begin:g}:{end:g},auto,auto,auto:",
+    "    jaxmuscle fit RECORD.csv --hold HOLD.csv --window {begin:g}:{end:g},auto --out out/both",
+    "- Without other recordings:",
+    "    jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g} --out"
+    " out/moved",
+)
+
 
 def design(
     source: Annotated[
@@ -65,13 +82,6 @@ def design(
             help="Share of the motion, 0 to 1, that is spread evenly over the band.",
         ),
     ] = 0.1,
-    durations: Annotated[
-        str | None,
-        typer.Option(
-            metavar="S,S",
-            help="Also tell the errors for records of these lengths in s, as 30,60,120.",
-        ),
-    ] = None,
     error: Annotated[
         float | None,
         typer.Option(
@@ -95,7 +105,7 @@ def design(
 
         jaxmuscle design fit.json --quantity K_w0 --rms 1 --band 0.5:5 --seconds 60 --out out/design
 
-        jaxmuscle design fit.json --quantity K_w0,K_z0 --durations 30,60,120 --error 10
+        jaxmuscle design fit.json --quantity K_w0,K_z0 --error 10
     """
     with reporting(as_json):
         from jaxmuscle._common.figures import write_figure
@@ -135,54 +145,27 @@ def design(
             acceleration=acceleration,
             spread=spread,
             key=seed,
-            durations=_lengths(durations),
             error=None if error is None else error / 100,
         )
         found.save(output / "motor.csv")
         found.save(output / "design.json")
         figures = write_figure(found.plot(), output, "design", formats_of(formats))
         record(output / "design.json")
-        out.print(plain_lines(found), highlight=False, soft_wrap=True)
+        out.print(plain_lines(found), soft_wrap=True)
         say_written(output, "motor.csv", "design.json", *figures)
         begin, end = found.window
-        period = found.lengthening.seconds
-        out.print(
-            folded(
-                [
-                    (
-                        f"- Play the motion for {found.played:g} s: motor.csv holds one period of"
-                        f" {period:g} s, to be repeated without a gap. Its first lines, which begin"
-                        " with #, say what it is. Let the motor move to its first value slowly."
-                        f" Its largest acceleration is {found.acceleration:.2g} m/s². If that is"
-                        " too much for your motor, design again and say how much it can do"
-                        " (--acceleration). If the person tires, record several shorter trials"
-                        " instead."
-                    ),
-                    (
-                        f"- Record force and displacement. Fit both channels from {begin:g} to"
-                        f" {end:g} s, together with what you have already: the errors above include"
-                        " that. Give each held trial with --hold, and an earlier moved record as a"
-                        " second file. In --window, give the window of the new record first, then"
-                        " one auto for each other file. For three held trials that is --window"
-                        f" {begin:g}:{end:g},auto,auto,auto:"
-                    ),
-                ]
-            ),
-            highlight=False,
-        )
-        out.print(
-            f"    jaxmuscle fit RECORD.csv --hold HOLD.csv --window {begin:g}:{end:g},auto --out"
-            " out/both",
-            highlight=False,
-            soft_wrap=True,
-        )
-        out.print(folded(["- Without other recordings:"]), highlight=False)
-        out.print(
-            f"    jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g}"
-            " --out out/moved",
-            highlight=False,
-            soft_wrap=True,
-        )
+        about = {
+            "begin": begin,
+            "end": end,
+            "played": found.played,
+            "period": found.lengthening.seconds,
+            "acceleration": found.acceleration,
+        }
+        for words in HOW_TO_RECORD:
+            said = words.format(**about)
+            # a command is copied, so that it keeps its line
+            line = said if said.startswith(" ") else folded([said])
+            out.print(line, soft_wrap=True)
 
 
 def _source(name: str) -> Any:
@@ -192,12 +175,3 @@ def _source(name: str) -> Any:
             f" first: jaxmuscle fit {name} --out out/fit, then jaxmuscle design out/fit/fit.json"
         )
     return jm.load_result(name) if Path(name).suffix == ".json" else jm.load_preset(name)
-
-
-def _lengths(text: str | None) -> list[float]:
-    try:
-        return [] if text is None else [float(length) for length in text.split(",")]
-    except ValueError:
-        raise ValueError(
-            f"--durations {text}: give lengths of the record in s, as --durations 30,60,120"
-        ) from None

@@ -62,9 +62,9 @@ def explore(
         path = _place(output, force=force)
         write_text(path, text)
         record({"page": str(path)})
-        out.print(f"Written: {plain(path)}", highlight=False, soft_wrap=True)
+        out.print(f"Written: {plain(path)}", soft_wrap=True)
         if browser and not webbrowser.open(path.resolve().as_uri()):
-            out.print("No browser was found. Open the file yourself.", highlight=False)
+            out.print("No browser was found. Open the file yourself.")
 
 
 def _content(what: str | None, task: TaskName | None, segments: int | None) -> tuple[Any, Any]:

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -289,9 +290,13 @@ def fit(
             given = read_with_holds(target, hold, reading, window)
             beside = [REACHED, *fit_files(output, ("moved", "held"))]
             writable(output, "fit.json", beside=beside, reads=[*target, *hold], force=force)
-            converged = _fit_with_holds(
-                *given, rung, output, options, figures, everything=everything
+            bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
+            models = (
+                rung if rung is None else {n: jm.model.on_rung(t, rung) for n, t in bases.items()}
             )
+            targets = {"moved": given[0], "held": given[1].target()}
+            asked = partial(jm.fit, models, targets, **options)
+            called = "the moved and the held record"
         else:
             options |= {
                 "method": str(method),
@@ -310,7 +315,9 @@ def fit(
             writable(output, "fit.json", beside=beside, reads=target, force=force)
             if rung is not None:
                 model = jm.model.on_rung(model, rung)
-            converged = _fit_alone(seen, model, output, options, figures, everything=everything)
+            asked = partial(jm.fit, model, seen, **options)
+            called = seen[0].name if isinstance(seen, list) else seen.name
+        converged = _fit_one(asked, called, output, figures, everything=everything)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
@@ -411,50 +418,8 @@ def _aim_at_spectrum(
     return aim_of(name, task, {"segments": read["segments"], "lever_arm": reading["lever_arm"]})
 
 
-def _fit_alone(
-    seen: Any,
-    model: Any,
-    folder: Path,
-    options: dict[str, Any],
-    formats: list[str],
-    *,
-    everything: bool,
-) -> bool:
-    """One spectrum, or the recordings of one condition."""
-
-    def fitted(tell: Any, answer: Any) -> Any:
-        return jm.fit(model, seen, progress=tell, answer=answer, **options)
-
-    called = seen[0].name if isinstance(seen, list) else seen.name
-    return _fit_one(fitted, called, folder, formats, everything=everything)
-
-
-def _fit_with_holds(
-    moved: Any,
-    held: Any,
-    rung: int | None,
-    folder: Path,
-    options: dict[str, Any],
-    formats: list[str],
-    *,
-    everything: bool,
-) -> bool:
-    """Records of a moved and of a held insertion; on one rung of the ladder if it is given."""
-    both = {"moved": moved, "held": held.target()}
-    bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
-    models = (
-        None if rung is None else {n: jm.model.on_rung(base, rung) for n, base in bases.items()}
-    )
-
-    def fitted(tell: Any, answer: Any) -> Any:
-        return jm.fit(models, both, progress=tell, answer=answer, **options)
-
-    called = "the moved and the held record"
-    return _fit_one(fitted, called, folder, formats, everything=everything)
-
-
 def _fit_one(
-    fit: Callable[[Any, Any], Any],
+    fit: Callable[..., Any],
     called: str,
     folder: Path,
     formats: list[str],
@@ -478,7 +443,7 @@ def _fit_one(
     stays(NOTHING)
     try:
         with told(True, f"fitting {called}") as tell:
-            result = fit(tell, answer)
+            result = fit(progress=tell, answer=answer)
             tell("writing", 1.0)
             files = write_fit(result, folder, formats, report=True)
     except jm.fits.FitInterrupted as stop:
@@ -505,11 +470,10 @@ def _fit_one(
         if sentence.removeprefix("note: ") not in told_before
     ]
     for sentence in new:
-        out.print(plain(sentence), highlight=False)
+        out.print(plain(sentence))
     if new and _numbers(printed[0]) != _numbers(result):
         out.print(
             "The checks moved the last digits a little: cite the numbers in the files.",
-            highlight=False,
         )
     say_written(folder, *files)
     return result.success

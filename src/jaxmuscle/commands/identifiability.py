@@ -70,7 +70,7 @@ def identifiability(
         found.save(output / "identifiability.json")
         figures = write_figure(found.plot(), output, "identifiability", formats_of(formats))
         record(output / "identifiability.json")
-        out.print(plain_lines(found), highlight=False, soft_wrap=True)
+        out.print(plain_lines(found), soft_wrap=True)
         say_written(output, "identifiability.json", *figures, "fit.json")
         stiffness = found.present.quantities.get("K_w0")
         if stiffness is not None and not stiffness.determined:
@@ -81,6 +81,5 @@ def identifiability(
                 " K_w_tangent --error 10 --spread 1. Its errors hold if m_z is about what the"
                 " motor will move: first fit with your estimate in kg (--fix m_z=2.3, say), if you"
                 " have not done so",
-                highlight=False,
                 soft_wrap=True,
             )

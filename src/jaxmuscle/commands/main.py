@@ -50,7 +50,7 @@ app.command()(explore)
 
 def show_version(wanted: bool) -> bool:
     if wanted:
-        out.print(f"jaxmuscle {__version__}", highlight=False)
+        out.print(f"jaxmuscle {__version__}")
         raise typer.Exit
     return wanted
 

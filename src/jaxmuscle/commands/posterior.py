@@ -20,6 +20,7 @@ from .console import (
     plain,
     record,
     reporting,
+    say_failure,
     show,
     writable,
 )
@@ -159,10 +160,7 @@ def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
 
 def _show(found: "Posterior", folder: Path) -> None:
     if not found.success:
-        err.print(
-            f"[bold red]failed:[/] {plain(found.message)}; the chains are in {plain(folder)}",
-            highlight=False,
-        )
+        say_failure(f"{found.message}; the chains are in {folder}")
         return
     show(found.summary(), success=True)
-    out.print(f"written to {plain(folder)}", highlight=False, soft_wrap=True)
+    out.print(f"written to {plain(folder)}", soft_wrap=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jaxmuscle as jm
 from jaxmuscle._common.units import NEWTONS
 
-from .console import err, plain
+from .console import say_notice
 from .options import PERTURBED, READING
 
 if TYPE_CHECKING:
@@ -121,11 +121,9 @@ def _held(tables: "Sequence[Table]", found: Sequence[dict[str, Any]]) -> bool:
             f" {moves[least]}), and that of {tables[most].file} moves by {moves[most]}. Give the"
             " files of a moved insertion first, and those of a held one with --hold"
         )
-    err.print(
-        f"[yellow]notice:[/] {plain(found[most]['displacement'])} rests (it moves by"
-        f" {moves[most]}), so the force is fitted as that of a hold. If a motor moved it, give"
-        " --task prescribed-length",
-        highlight=False,
+    say_notice(
+        f"{found[most]['displacement']} rests (it moves by {moves[most]}), so the force is fitted"
+        " as that of a hold. If a motor moved it, give --task prescribed-length"
     )
     return True
 

@@ -54,9 +54,9 @@ def reproduce(
 def _reproduce(folder: Path, given) -> None:
     rows = paper.check(paper.reproduce(folder, given, progress=True))
     record({"summary": paper.counted(rows), "claims": [row._asdict() for row in rows]})
-    out.print(paper.counted(rows), highlight=False)
+    out.print(paper.counted(rows))
     for row in rows:
         if row.verdict == "does not agree":
             says = f"does not agree ({row.kind}): {row.says} ({row.source}): {row.ours}"
-            out.print(says, highlight=False, markup=False)
+            out.print(says, markup=False)
     say_written(folder, "index.html", "fig2 to fig8 (.png, .pdf)", "claims.json")

@@ -111,13 +111,12 @@ def _simulate(
             "files": [str(folder / name) for name in files],
         }
     )
-    out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s", highlight=False)
+    out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s")
     level = f"{held.mean():.4g} {model.output_unit}"
     spread = spread or f", standard deviation {held.std():.3g} {model.output_unit}"
-    out.print(f"{model.output_name}: mean {level}{spread}", highlight=False)
+    out.print(f"{model.output_name}: mean {level}{spread}")
     locals_ = ", ".join(f"{p.frequency:.3f}" for p in found.local_maxima) or "none"
     out.print(
         f"Spectrum: maximum at {found.maximum.frequency:.3f} Hz, local maxima at {locals_} Hz",
-        highlight=False,
     )
     say_written(folder, *files)

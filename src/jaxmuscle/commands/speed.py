@@ -54,4 +54,4 @@ def speed(
         record(found)
         for name, value in found.items():
             shown = f"{value:.4g}" if isinstance(value, float) else str(value)
-            out.print(f"{name.replace('_', ' '):<28}{shown}", highlight=False)
+            out.print(f"{name.replace('_', ' '):<28}{shown}")

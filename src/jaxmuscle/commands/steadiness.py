@@ -85,5 +85,5 @@ def steadiness(
         write_text(output / "steadiness.csv", csv_of(found.to_dataframe()))
         figures = write_figure(found.plot(), output, "steadiness", formats_of(formats))
         record(output / "steadiness.json")
-        out.print(plain_lines(found), highlight=False, soft_wrap=True)
+        out.print(plain_lines(found), soft_wrap=True)
         say_written(output, "steadiness.json", "steadiness.csv", *figures)

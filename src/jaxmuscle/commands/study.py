@@ -10,10 +10,9 @@ import jaxmuscle as jm
 from .console import (
     CONVERGED,
     NOT_CONVERGED,
-    err,
-    plain,
     record,
     reporting,
+    say_notice,
     say_written,
     show,
     writable,
@@ -136,7 +135,7 @@ def write_study(found: "StudyResult", output: Path, formats: list[str]) -> None:
             whose.setdefault(notice, []).append(cell.target.name)
     for notice, names in whose.items():
         said = "all" if len(names) == len(found.cells) else "; ".join(names)
-        err.print(f"[yellow]notice:[/] {plain(said)}: {plain(notice)}", highlight=False)
+        say_notice(f"{said}: {notice}")
     found.save(output, formats)
     study_report(found, output)
     record(output / "study.json")

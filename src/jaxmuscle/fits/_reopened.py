@@ -4,6 +4,7 @@ and checks of a fit begin with it.
 
 import dataclasses
 from collections.abc import Iterable, Mapping
+from typing import TypedDict
 
 import numpy as np
 
@@ -19,6 +20,14 @@ from jaxmuscle.response._second_order import warn_beyond
 
 from ._joint import planned_jointly
 from ._result import FitResult
+
+
+class ReopenOptions(TypedDict, total=False):
+    """What `profile` and `posterior` take instead of the fit's own."""
+
+    free: Iterable[str] | None
+    bounds: Mapping[str, tuple[float, float]] | None
+    priors: Mapping[str, float | tuple[float, float | None] | None] | None
 
 
 def bounds_of(

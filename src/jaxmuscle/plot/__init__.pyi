@@ -17,7 +17,6 @@ from ._posterior import chains as chains
 from ._posterior import posterior as posterior
 from ._posterior import predictive as predictive
 from ._profile import profile as profile
-from ._profile import profiles as profiles
 from ._recording import recording as recording
 from ._recording import trials as trials
 from ._schematic import schematic as schematic
@@ -29,7 +28,6 @@ from ._spectra import QUANTILES as QUANTILES
 from ._spectra import estimate as estimate
 from ._spectra import spectrum as spectrum
 from ._spectra import target as target
-from ._starts import start_values as start_values
 from ._starts import starts as starts
 from ._steadiness import steadiness as steadiness
 from ._study import study as study

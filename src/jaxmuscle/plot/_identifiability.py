@@ -25,7 +25,6 @@ TEXT, DOTS, ROW = 0.14, 0.15, 0.2  # inches: a line of words, its dots, a row of
 NAMES, CELL = 1.3, 0.28  # inches: the names of quantities, the narrowest column
 LEAST, EDGE = 1e-2, 5e-3
 WRAP, WIDEST = 60, 20  # letters
-PAIRS = 3
 # share of the prior's error at which the colours would begin: black is read on all that are left
 PALE = -0.6
 
@@ -40,12 +39,10 @@ def identifiability(report: Any, ax: Axes | None = None) -> AnyFigure:
     shares by band are in the table alone. Letters are legible in a column of 85 mm, as far as ten
     measurements.
     """
-    letters = {d.name: report.letter(i) for i, d in enumerate(report.designs)}
-    possible = [d for d in report.designs if d.failed is None]
-    shown = [report.present, *possible, *report.telling_pairs[:PAIRS]]
-    marks = [" + ".join(letters[name] for name in o.name.split(report.together)) for o in shown[1:]]
-    marks = ["now", *marks]
-    labels = [_label(mark, o.name) for mark, o in zip(marks, shown, strict=True)]
+    possible = {report.letter(i): d for i, d in enumerate(report.designs) if d.failed is None}
+    shown, marks = [report.present, *possible.values()], ["now", *possible]
+    labels = [textwrap.fill(f"{mark}: {d.name}", WRAP) for mark, d in possible.items()]
+    labels = ["now", *labels]
     lines = sum(label.count("\n") + 1 for label in labels)
     names = [
         name for name in report.names if not name.startswith("band_")
@@ -57,12 +54,6 @@ def identifiability(report: Any, ax: Axes | None = None) -> AnyFigure:
     _singular_values(upper.add_subplot(), shown, labels, report.threshold)
     _matrix(lower.add_subplot(), shown, marks, names, report.open_in_fit)
     return finish(fig, heights, report.target, bad=report.doubt, columns=3, width=width)
-
-
-def _label(mark: str, name: str) -> str:
-    if mark == "now" or " + " in mark:
-        return mark
-    return "\n".join(textwrap.wrap(f"{mark}: {name}", WRAP, break_long_words=False))
 
 
 def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: float) -> None:
@@ -125,7 +116,6 @@ def _matrix(
             ax.text(j, i, number, ha="center", va="center", color="black", weight=weight)
         labels.append(_wrapped(name) + (f" ({unit})" if unit != "%" else ""))
     ax.set_yticks(range(len(names)), labels, linespacing=0.9)
-    marks = [mark.replace(" + ", "\n+") for mark in marks]
     ax.set_xticks(range(len(shown)), marks, weight="bold", linespacing=0.95)
     ax.set_xticks(np.arange(len(shown) + 1) - 0.5, minor=True)
     ax.set_yticks(np.arange(len(names) + 1) - 0.5, minor=True)

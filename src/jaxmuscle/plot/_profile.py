@@ -1,31 +1,14 @@
-"""The figures of profile likelihoods, one or several."""
+"""The figure of a profile likelihood."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from ._numbers import unit_in_print
-from ._style import (
-    ACROSS,
-    BLUE,
-    GREY,
-    ORANGE,
-    AnyFigure,
-    Style,
-    axes_or_new,
-    canvas,
-    finish,
-    log_axis,
-    panel_grid,
-    rows_for,
-    styled,
-    without_legend,
-)
+from ._style import BLUE, GREY, ORANGE, Style, axes_or_new, log_axis, styled
 
 SHOWN = 3.0  # times the threshold
-HEIGHT = 1.7  # inches
 # whether the lower and the upper end are open
 OPEN = {(True, True): "on both sides", (True, False): "downwards", (False, True): "upwards"}
 
@@ -64,23 +47,6 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
         frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0
     )
     return ax
-
-
-@styled
-def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> AnyFigure:
-    """Draws several `profiles` of one fit beside each other, each as `profile` does, with one
-    legend; `ax`, their place.
-
-    Returns the figure. Raises `ValueError` where there is none.
-    """
-    if not profiles:
-        raise ValueError("profiles: is empty; give [jm.profile(result, name) for name in ...]")
-    across = min(len(profiles), ACROSS)
-    heights = [HEIGHT] * rows_for(len(profiles), across)
-    fig = canvas(ax, heights)
-    for panel, found in zip(panel_grid(fig, len(profiles), across)[0], profiles, strict=True):
-        without_legend(profile(found, panel)).set_title("")
-    return finish(fig, heights, profiles[0].target)
 
 
 def _beside(inside: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@ how it was made."""
 
 import shlex
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +57,21 @@ FIGURES = {
 }
 
 
+# what to do with draws that may not be believed (False), and with others (True)
+AFTER_A_POSTERIOR = {
+    True: (
+        "Report medians with their 95 % intervals, R-hat and the effective sample sizes.",
+        "All draws are in posterior.nc: `arviz.from_netcdf` reads it.",
+    ),
+    False: (
+        "Do not use these draws.",
+        "Draw longer: `--warmup 2000 --draws 4000`.",
+        "Or fit again with some of the parameters fixed that the data do not determine"
+        " (`jaxmuscle fit ... --fix NAME=VALUE`), and draw from that fit.",
+    ),
+}
+
+
 def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
     """Write report.html of a fit of one target, or of several of one person."""
     card = result.summary()
@@ -63,42 +79,32 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
         state: [row[:STATE] + row[STATE + 1 :] for row in card.rows if row[STATE] == state]
         for state in ("measured", "determined", "not determined", "fixed")
     }
+    held = result.adequate is not False
     body = [
         _verdict(card.heading, good=False if not result.success else result.adequate),
-        *(
-            [
-                pages.heading("What is measured"),
-                pages.table(PARAMETERS[:STATE], [row[:STATE] for row in rows["measured"]]),
-            ]
-            if rows["measured"]
-            else []
-        ),
-        pages.heading("What the data determine" if result.adequate is not False else WOULD),
-        (
-            pages.table(PARAMETERS, rows["determined"])
-            if rows["determined"]
-            else pages.paragraph("Nothing.")
+        *_table("What is measured", PARAMETERS[:STATE], [row[:STATE] for row in rows["measured"]]),
+        *_table(
+            "What the data determine" if held else WOULD,
+            PARAMETERS,
+            rows["determined"],
+            otherwise="Nothing.",
         ),
         *_tried(result),
         pages.picture(figure, FIGURES["fit" if _has_spectrum(result) else "stiffness"]),
-        pages.heading("What to know about this fit"),
-        pages.items(card.remarks),
-        *(
-            [pages.paragraph("The data leave open:"), pages.items(result.undetermined)]
-            if result.undetermined
-            else []
-        ),
-        pages.heading("What to do next"),
-        pages.items(_after_a_fit(result, folder / "fit.json")),
+        *_list("What to know about this fit", card.remarks),
     ]
-    if rows["not determined"]:
-        body += [
-            pages.heading("What the data do not determine"),
-            pages.paragraph("Do not interpret these values."),
-            pages.table(PARAMETERS, rows["not determined"]),
-        ]
-    if rows["fixed"]:
-        body += [pages.heading("What was fixed"), pages.table(PARAMETERS, rows["fixed"])]
+    if result.undetermined:
+        body += [pages.paragraph("The data leave open:"), pages.items(result.undetermined)]
+    body += [
+        *_list("What to do next", _after_a_fit(result, folder / "fit.json")),
+        *_table(
+            "What the data do not determine",
+            PARAMETERS,
+            rows["not determined"],
+            said="Do not interpret these values.",
+        ),
+        *_table("What was fixed", PARAMETERS, rows["fixed"]),
+    ]
     if methods := result.methods():
         body += [pages.heading("For your methods section"), pages.paragraph(methods)]
     body += _data(result.targets)
@@ -108,8 +114,6 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
 
 def _tried(result: "FitResult") -> list[Html]:
     """The models that were tried, where there were several."""
-    if len(result.ladder) < 2:
-        return []
     rows = [
         (
             str(rung.number),
@@ -121,13 +125,12 @@ def _tried(result: "FitResult") -> list[Html]:
         )
         for rung in result.ladder
     ]
-    return [
-        pages.heading("Models tried"),
-        pages.paragraph(
-            "Simplest first. The numbers are those before the correction by simulation."
-        ),
-        pages.table(("", "model", "chi2 per bin", "p", "AIC", ""), rows),
-    ]
+    return _table(
+        "Models tried",
+        ("", "model", "chi2 per bin", "p", "AIC", ""),
+        rows if len(rows) > 1 else [],
+        said="Simplest first. The numbers are those before the correction by simulation.",
+    )
 
 
 def cohort_report(
@@ -164,28 +167,27 @@ def cohort_report(
         )
         for d in cohort.differences()
     ]
-    if differences:
-        columns = ("quantity", "groups", "difference of means", "95 % interval", "unit")
-        body += [pages.heading("What differs between groups"), pages.table(columns, differences)]
+    fits = ", ".join(f"`{place / 'fit.json'}`" for place in places.values())
     body += [
-        pages.heading("What the data determine"),
-        (
-            pages.table(("target", "group", "quantity", "value", "unit"), numbers)
-            if numbers
-            else pages.paragraph("Nothing.")
+        *_table(
+            "What differs between groups",
+            ("quantity", "groups", "difference of means", "95 % interval", "unit"),
+            differences,
         ),
-        pages.heading("What to do next"),
-        pages.items(
+        *_table(
+            "What the data determine",
+            ("target", "group", "quantity", "value", "unit"),
+            numbers,
+            otherwise="Nothing.",
+        ),
+        *_list(
+            "What to do next",
             (
-                (
-                    "Fit a target alone for the checks that a cohort leaves out: `jaxmuscle fit"
-                    " TARGET`."
-                ),
+                "Fit a target alone for the checks that a cohort leaves out: `jaxmuscle fit"
+                " TARGET`.",
                 "Do not interpret the numbers of a target that the model does not describe.",
-                "All numbers are in cohort.csv; each fit is in "
-                + ", ".join(f"`{place / 'fit.json'}`" for place in places.values())
-                + ".",
-            )
+                f"All numbers are in cohort.csv; each fit is in {fits}.",
+            ),
         ),
     ]
     first = next(iter(cohort.results.values()))
@@ -218,34 +220,30 @@ def study_report(study: "StudyResult", folder: Path) -> None:
     fits += [(name, f"not fitted: {why}") for name, why in study.cohort.failed.items()]
     body = [
         pages.items((people_in_words(study), trials_in_words(study))),
-        pages.heading("Table 1: mean ± SD of people"),
-        pages.table(("", *heads), [(words, *cells) for words, cells in lines]),
-        *pictures,
-        pages.heading("What differs"),
-        pages.table(columns, rows) if rows else pages.paragraph("Nothing could be compared."),
-        *(
-            [
-                pages.heading("The fits"),
-                _verdict(study.cohort.verdict, good=study.success),
-                pages.table(("person and condition", "in words"), fits),
-            ]
-            if study.aic
-            else []
+        *_table(
+            "Table 1: mean ± SD of people",
+            ("", *heads),
+            [(words, *cells) for words, cells in lines],
         ),
+        *pictures,
+        *_table("What differs", columns, rows, otherwise="Nothing could be compared."),
+    ]
+    if study.aic:
+        verdict = _verdict(study.cohort.verdict, good=study.success)
+        table = pages.table(("person and condition", "in words"), fits)
+        body += [pages.heading("The fits"), verdict, table]
+    options = {n: v for n, v in study.options.items() if study.aic or n not in OF_MODEL}
+    body += [
         pages.heading("For your methods section"),
         pages.paragraph(study.methods()),
-        pages.heading("What to do next"),
-        pages.items(
+        *_list(
+            "What to do next",
             (
                 "Report p corrected, and how many people were left out of each comparison.",
                 "All numbers are in table1.csv, people.csv and differences.csv.",
-            )
+            ),
         ),
-        *_how(
-            {n: v for n, v in study.options.items() if study.aic or n not in OF_MODEL}
-            | {"source": study.source},
-            versions(),
-        ),
+        *_how(options | {"source": study.source}, versions()),
     ]
     pages.write_page(folder / REPORT, "Study", body)
 
@@ -272,36 +270,44 @@ def posterior_report(
                     f"{size:.0f}",
                 )
             )
-        body += [pages.heading("What the data determine"), pages.table(columns, rows[True])]
+        body += _table("What the data determine", columns, rows[True], otherwise="Nothing.")
         body += _pictures(figures, drawn)
-        body += (
-            [
-                pages.heading("What the data do not determine"),
-                pages.paragraph("These come from the prior. Do not interpret them."),
-                pages.table(columns, rows[False]),
-            ]
-            if rows[False]
-            else []
-        )
-        after = (
-            "Report medians with their 95 % intervals, R-hat and the effective sample sizes.",
-            "All draws are in posterior.nc: `arviz.from_netcdf` reads it.",
+        body += _table(
+            "What the data do not determine",
+            columns,
+            rows[False],
+            said="These come from the prior. Do not interpret them.",
         )
     else:
         body += _pictures(figures, drawn)
-        after = (
-            "Do not use these draws.",
-            "Draw longer: `--warmup 2000 --draws 4000`.",
-            (
-                "Or fit again with some of the parameters fixed that the data do not determine "
-                "(`jaxmuscle fit ... --fix NAME=VALUE`), and draw from that fit."
-            ),
-        )
-    body += [pages.heading("What to know about this posterior"), pages.code(str(found))]
-    body += [pages.heading("What to do next"), pages.items(after)]
-    body += _data({name: part.target for name, part in found.parts.items()})
-    body += _how(found.settings | {"seed": found.seed}, found.versions)
+    body += [
+        pages.heading("What to know about this posterior"),
+        pages.code(str(found)),
+        *_list("What to do next", AFTER_A_POSTERIOR[found.success]),
+        *_data({name: part.target for name, part in found.parts.items()}),
+        *_how(found.settings | {"seed": found.seed}, found.versions),
+    ]
     pages.write_page(folder / REPORT, f"Posterior of {found.title}", body)
+
+
+def _table(
+    title: str,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    said: str = "",
+    otherwise: str = "",
+) -> list[Html]:
+    """A section with a table; without rows what is said `otherwise`, or nothing at all."""
+    if not rows:
+        return [pages.heading(title), pages.paragraph(otherwise)] if otherwise else []
+    before = [pages.paragraph(said)] if said else []
+    return [pages.heading(title), *before, pages.table(columns, rows)]
+
+
+def _list(title: str, texts: Iterable[str]) -> list[Html]:
+    """A section with a list."""
+    return [pages.heading(title), pages.items(texts)]
 
 
 def _unit(unit: str) -> str:

@@ -16,20 +16,17 @@ from jaxmuscle.objective._derived import MEAN, TANGENTS
 
 from ._identifiability_report import BASE
 from ._lengthening import Lengthening, Lines, Samples
-from ._multisine import speed_of
+from ._multisine import Motion, derivatives
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 USUAL = PARAMETERS["m_w"].default  # kg
-FEWER_LINES = 1.6  # times as long as a part of a longer motion
-SHORTEST = 1.0  # s of a record that are worth telling of
 SHOWN = 2.0  # times the even density: where a design moves the most
 DOUBTFUL = 0.3  # relative standard error
 ENDURED = 3600.0  # s of a record
 # a motion this much smaller, or this near to its limit
 LIMITS, SMALLER = ("peak", "speed", "acceleration"), 0.9
-MUCH, EXACT = 1.3, 0.05  # times as exact; a relative error that needs no other motion
 LOOSE = 0.33  # a third of the usual prior, 1 in the logarithm
 # What is printed, by what it is about.
 WORDS = {
@@ -37,10 +34,6 @@ WORDS = {
         "{kind} motion: one more record of {seconds:g} s would measure {best} (standard error{s})"
     ),
     "vague": "  so far {name} is known only to {error}{others}. {advice}",
-    "elsewhere": (
-        "  {name} may well be {may} instead of {value:.3g}{unit}. Then this record would tell it to"
-        " {to}"
-    ),
     "gain": (
         "  a flat motion of {rms:.3g} mm rms: {flat}. The {square} is then {gain:.2g} times as"
         " large"
@@ -63,36 +56,14 @@ WORDS = {
         "  a quantity with a larger error than about 33 % will stay 'not determined' in the fit:"
         " its error must be at most a third of its prior's"
     ),
-    "wider": (
-        "  a flat motion up to {high:g} Hz would tell {told}. If your motor can do that, design"
-        " again with --band {low:.2g}:{high:g} (band=({low:.2g}, {high:g}))"
-    ),
-    "lengths": "  the same for records of other lengths, in which the motion repeats:",
 }
 # The record that reaches the error that was asked for.
 GOAL = {
-    "no record": ("  no length of the record tells {goal}: {larger}, or choose another band"),
+    "no record": ("  no record that a person holds tells {goal}: {larger}, or choose another band"),
     "is known": "  {goal}: what is known without this record is enough for that",
-    "at once": (
-        "  {goal}: less than {shortest:g} s of this motion would tell that. Play one period"
-    ),
-    "too long": (
-        "  to know {goal}, a record of {hours:.2g} hours would be needed, which nobody holds:"
-        " {larger}, or choose another band"
-    ),
-    "several periods": (
-        "  to know {goal}, {seconds:.3g} s of record are enough{if_so}: {periods} periods of this"
-        " motion. Play {played:.3g} s and analyse {begin:.3g} to {end:.3g} s"
-    ),
-    "shorter": (
-        "  to know {goal}, {seconds:.3g} s of record are enough{if_so}; this motion lasts"
-        " {period:.3g} s. To record less, design again with --seconds {shorter:g}"
-        " (seconds={shorter:.1f}). That is longer than {seconds:.3g} s, since a shorter motion has"
-        " fewer frequencies"
-    ),
-    "one period": (
-        "  to know {goal}, {seconds:.3g} s of record are enough{if_so}: one period of this motion."
-        " Play {played:.3g} s and analyse {begin:.3g} to {end:.3g} s"
+    "enough": (
+        "  to know {goal}, {seconds:.3g} s of record are enough{if_so}; the motion repeats after"
+        " {period:.3g} s. Play {played:.3g} s and analyse {begin:.3g} to {end:.3g} s"
     ),
 }
 ADVICE = {
@@ -162,50 +133,40 @@ class DesignedInput(Printed, Result, eqx.Module):
     """A periodic motion of the insertion, made by `design_input`, and what one record of it is
     expected to tell.
 
-    `quantity`, the names of what it was made for; `lengthening`, its lines; `even`, those of a flat
-    motion: of even density in the band and as large as the same limits allow; `displacement` [m] at
-    `time` [s], one period at `rate` [Hz], positive where the muscle gets longer (the motor pulls
-    away from it: x_z = -displacement); `values` and `units` of every free parameter and derived
-    quantity, and their standard errors in these units: `prior`, without any data; `now`, without
-    the record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of
-    it that have other lengths [s]; `needed`, the relative error that was asked for and the length
-    [s] of the record that reaches it, or None; `notices`, what to know before; `elsewhere`, of each
-    quantity that is hardly known so far: its value one standard error below and above, and the
-    error that this motion gives there, both in its unit; `masses` [kg] that the given fit does not
+    `quantity`, the names of what it was made for; `asked`, its limits, band, length and rate;
+    `lengthening`, its lines; `even`, those of a flat motion: of even density in the band and as
+    large as the same limits allow; `displacement` [m] at `time` [s], one period, positive where the
+    muscle gets longer (the motor pulls away from it: x_z = -displacement); `values` and `units` of
+    every free parameter and derived quantity, and their standard errors in these units: `prior`,
+    without any data; `now`, without the record; `flat`, with the flat motion; `stderr`, with this
+    one; `needed`, the relative error that was asked for and the length [s] of the record that
+    reaches it, or None; `notices`, what to know before; `masses` [kg] that the given fit does not
     have free. Those among them that are `held` count as known: that fit has a moved record already,
-    and had them fixed. All others are fitted with the new record; `wider`, a frequency [Hz] twice
-    as high as the band's highest, and the errors with a flat motion up to there, or None; `moved`,
-    whether a moved record is known already; `allowed`, the rms [m] that was asked for, and the
-    largest displacement [m], speed [m/s] and acceleration [m/s²], infinite where there is no limit.
+    and had them fixed. All others are fitted with the new record; `moved`, whether a moved record
+    is known already.
     """
 
     quantity: tuple[str, ...] = eqx.field(static=True)
+    asked: Motion = eqx.field(static=True)
     lengthening: Lengthening
     even: Lengthening
     displacement: Samples
-    rate: float
     values: dict[str, float]
     units: dict[str, str] = eqx.field(static=True)
+    prior: Errors
     now: Errors
     flat: Errors
     stderr: Errors
-    by_seconds: dict[float, Errors]
     needed: tuple[float, float] | None
     notices: tuple[str, ...] = eqx.field(static=True, default=())
-    elsewhere: dict[str, tuple[tuple[float, float], ...]] = eqx.field(default_factory=dict)
     masses: dict[str, float] = eqx.field(default_factory=dict)
     held: tuple[str, ...] = eqx.field(static=True, default=())
-    prior: Errors = eqx.field(default_factory=dict)
-    wider: tuple[float, Errors] | None = None
     moved: bool = eqx.field(static=True, default=False)
-    allowed: tuple[float, float, float, float] = eqx.field(
-        static=True, default=(0.0, np.inf, np.inf, np.inf)
-    )
 
     @property
     def time(self) -> Samples:
         """Time of every sample [s]."""
-        return np.arange(len(self.displacement)) / self.rate
+        return np.arange(len(self.displacement)) / self.asked.rate
 
     @property
     def frequency(self) -> Lines:
@@ -225,18 +186,23 @@ class DesignedInput(Printed, Result, eqx.Module):
     @property
     def peak(self) -> float:
         """Largest displacement to either side [m]."""
-        return float(np.max(np.abs(self.displacement)))
+        return self._largest[0]
 
     @property
     def speed(self) -> float:
         """Largest speed [m/s]."""
-        return float(np.max(np.abs(speed_of(self.displacement, self.lengthening.seconds))))
+        return self._largest[1]
 
     @property
     def acceleration(self) -> float:
         """Largest acceleration [m/s²]."""
-        period = self.lengthening.seconds
-        return float(np.max(np.abs(speed_of(speed_of(self.displacement, period), period))))
+        return self._largest[2]
+
+    @property
+    def _largest(self) -> list[float]:
+        """Largest displacement [m], speed [m/s] and acceleration [m/s²] to either side."""
+        moved = derivatives(self.displacement, self.lengthening.seconds)
+        return np.max(np.abs(moved), axis=1).tolist()
 
     @property
     def gain(self) -> float:
@@ -298,15 +264,15 @@ class DesignedInput(Printed, Result, eqx.Module):
 
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings, without the signal."""
-        own = ("rate", "rms", "peak", "speed", "acceleration")
+        own = ("rms", "peak", "speed", "acceleration")
         errors = {which: getattr(self, which) for which in ("prior", "now", "flat", "stderr")}
         table = {
             "format": 1,
             "quantity": self.quantity,
             "gain": self.gain,
             "seconds": self.lengthening.seconds,
+            "rate": self.asked.rate,
             **{name: getattr(self, name) for name in own},
-            "by_seconds": [{"seconds": s, "stderr": e} for s, e in self.by_seconds.items()],
             "needed": self.needed and dict(zip(("error", "seconds"), self.needed, strict=True)),
             "frequency_hz": self.frequency,
             "density": self.density,
@@ -315,11 +281,6 @@ class DesignedInput(Printed, Result, eqx.Module):
                 | {which: e[n] for which, e in errors.items()}
                 for n, v in self.values.items()
             },
-            "elsewhere": {
-                n: [dict(zip(("value", "stderr"), side, strict=True)) for side in sides]
-                for n, sides in self.elsewhere.items()
-            },
-            "wider": self.wider and dict(zip(("hz", "stderr"), self.wider, strict=True)),
             "masses": {
                 n: {"value": v, "fitted": n not in self.held} for n, v in self.masses.items()
             },
@@ -353,8 +314,6 @@ class DesignedInput(Printed, Result, eqx.Module):
                 *self._heading(),
                 *self._motion(),
                 *self._table(),
-                *self._wider(),
-                *self._by_duration(),
                 *self._goal(),
                 *self._as_fitted(),
                 *ALWAYS_ASSUMED,
@@ -366,7 +325,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         return [words.format(n, _digits(self.percent(n, errors))) for n in self.quantity]
 
     def _heading(self) -> list[str]:
-        """What the record would tell, as the muscle is known so far, and if it is another one."""
+        """What the record would tell, and how well the muscle is known so far."""
         lines = [
             WORDS["heading"].format(
                 kind="designed" if self.moves else "flat",
@@ -381,13 +340,6 @@ class DesignedInput(Printed, Result, eqx.Module):
             advice = ADVICE["moved" if self.moved else "designed" if self.moves else "flat"]
             about = {"name": name, "error": error, "others": others, "advice": advice}
             lines += [WORDS["vague"].format(**about)]
-        for name, sides in self.elsewhere.items():
-            unit = "" if self.units[name] == "1" else f" {self.units[name]}"
-            known = [(value, error) for value, error in sides if np.isfinite(value) and value != 0]
-            may = " or ".join(f"{value:.3g}{unit}" for value, _ in known)
-            to = " or ".join(f"{_digits(100 * error / abs(value))} %" for value, error in known)
-            about = {"name": name, "may": may, "value": self.values[name], "unit": unit, "to": to}
-            lines += [WORDS["elsewhere"].format(**about)] * bool(known)
         return lines + [f"  note: {notice}" for notice in self.notices]
 
     @property
@@ -423,7 +375,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         lines += [WORDS["motion"].format(low=low, high=high, **self._size)]
         if (limit := self._limit) is not None:
             slower = ", or a band with lower frequencies" * (limit in LIMITS[1:])
-            rms = 1e3 * self.allowed[0]
+            rms = 1e3 * self.asked.rms
             lines += [WORDS["limited"].format(limit=limit, rms=rms, slower=slower)]
         most = " and ".join(
             f"{100 * share:.0f} % at {a:.2g} to {b:.2g} Hz" for a, b, share in self.moves
@@ -433,13 +385,10 @@ class DesignedInput(Printed, Result, eqx.Module):
     @property
     def _limit(self) -> str | None:
         """Which limit keeps the motion smaller than was asked for, by its option, or None."""
-        rms, *limits = self.allowed
-        reached = np.array([self.peak, self.speed, self.acceleration]) / limits
-        return (
-            LIMITS[int(np.argmax(reached))]
-            if self.rms < SMALLER * rms and np.max(reached) > SMALLER
-            else None
-        )
+        size = np.array([self.peak, self.speed, self.acceleration])
+        reached = size / self.asked.limits
+        limited = self.rms < SMALLER * self.asked.rms and np.max(reached) > SMALLER
+        return LIMITS[int(np.argmax(reached))] if limited else None
 
     def _table(self) -> list[str]:
         """The expected errors; a motion that is flat itself is no other one."""
@@ -447,33 +396,13 @@ class DesignedInput(Printed, Result, eqx.Module):
         if self.moves:
             columns |= {"flat": self.flat, "designed": self.stderr}
         loose = any(self.percent(n, self.stderr) > 100 * LOOSE for n in self.names)
-        return [WORDS["errors"], *self._rows(columns), *[WORDS["open"]] * loose]
-
-    def _rows(self, columns: dict[str, Errors]) -> list[str]:
-        """A row for each quantity, a column for each kind of error."""
         heads = NAME.format("") + "".join(f"{head:>10}" for head in columns)
-        return [heads] + [
+        rows = [
             NAME.format(n)
             + "".join(f"{_digits(self.percent(n, errors)):>10}" for errors in columns.values())
             for n in self.names
         ]
-
-    def _wider(self) -> list[str]:
-        """Whether a band twice as wide tells much more: up to 5 Hz a stiff muscle shows too little
-        of its parts."""
-        exact = all(self.percent(n, self.stderr) < 100 * EXACT for n in self.quantity)
-        if self.wider is None or exact:
-            return []
-        high, errors = self.wider
-        if all(self.flat[n] < MUCH * errors[n] for n in self.quantity):
-            return []
-        told = " and ".join(self._in_percent(errors))
-        return [WORDS["wider"].format(low=self.frequency[0], high=high, told=told)]
-
-    def _by_duration(self) -> list[str]:
-        """The errors by the length of the record."""
-        columns = {f"{seconds:g} s": errors for seconds, errors in self.by_seconds.items()}
-        return [WORDS["lengths"], *self._rows(columns)] if columns else []
+        return [WORDS["errors"], heads, *rows, *[WORDS["open"]] * loose]
 
     def _goal(self) -> list[str]:
         """How long a record takes to reach the error that was asked for."""
@@ -481,17 +410,8 @@ class DesignedInput(Printed, Result, eqx.Module):
             return []
         error, seconds = self.needed
         (begin, end), period = self.window, self.lengthening.seconds
-        periods, shorter = round((end - begin) / period), float(np.ceil(FEWER_LINES * seconds))
-        cases = {
-            "no record": not np.isfinite(seconds),
-            "is known": all(self.percent(n, self.now) <= 100 * error for n in self.quantity),
-            "at once": seconds < SHORTEST,
-            "too long": seconds > ENDURED,
-            "several periods": periods > 1,
-            "shorter": shorter < period,
-            "one period": True,
-        }
-        case = next(case for case, is_so in cases.items() if is_so)
+        known = all(self.percent(n, self.now) <= 100 * error for n in self.quantity)
+        case = "is known" if known else "enough" if seconds <= ENDURED else "no record"
         about = {
             "goal": f"{' and '.join(self.quantity)} to {100 * error:.3g} % (standard error)",
             "larger": (
@@ -501,12 +421,9 @@ class DesignedInput(Printed, Result, eqx.Module):
             ),
             "if_so": ", if the muscle is like the one given here" * bool(self._vague),
             "seconds": seconds,
-            "hours": seconds / 3600,
-            "shortest": SHORTEST,
-            "shorter": shorter,
             "played": self.played,
         }
-        return [GOAL[case].format(begin=begin, end=end, period=period, periods=periods, **about)]
+        return [GOAL[case].format(begin=begin, end=end, period=period, **about)]
 
     def _as_fitted(self) -> list[str]:
         """What the design takes from the fit, and what to do if that is doubtful."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, PrescribedLength
-from jaxmuscle.objective._arguments import INPUTS, MASSES, base_of
+from jaxmuscle.objective._arguments import MASSES
 from jaxmuscle.objective._consequences import Expansion
 from jaxmuscle.objective._likelihood import require_spread
 from jaxmuscle.objective._problem import FitProblem, Part
@@ -18,7 +18,6 @@ from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._scaling import FORCES
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from ._identifiability_report import FITTED_TOO
 from ._lengthening import Lengthening
 
 AMPLITUDES = ("noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
@@ -29,11 +28,6 @@ LONGER = 10
 MOVED = ((1e-4, (0.5, 10.0)), (1e-3, (0.5, 5.0)))
 MOST_VARIATION = 1e3
 MOTION = "{:g} s with the insertion moved by {:.3g} mm rms to {:.3g} Hz"
-HELD: dict[type[AbstractTask], str] = {
-    Isometric: "insertion held, force measured",
-    PrescribedForce: "insertion free under a constant force, displacement measured",
-    PrescribedLength: "insertion moved by a motor, force measured",
-}
 
 
 class Design(eqx.Module):
@@ -110,28 +104,6 @@ class Design(eqx.Module):
         """Whether a motor moves the insertion."""
         return self.lengthening is not None
 
-    def describe(self, problem: FitProblem) -> tuple[str, str]:
-        """For the package itself:
-
-        task and data in words. What the design leaves open is taken from the `problem` of a fit.
-        """
-        data, like, kind = [], self.like(problem), None
-        task = like.task if self.task is None else self.task
-        if self.spectral:
-            settings = like.target.settings if self.settings is None else self.settings
-            data += [_spectrum_in_words(self.counts or segments_of(like.target), settings)]
-        data += ["coefficient of variation"] * self.coefficient_of_variation
-        data += [] if self.mean is None else [f"mean to {100 * self.mean:.2g} %"]
-        if self.moves:
-            kind = PrescribedLength
-            own = next(i for i, part in enumerate(problem.parts) if part is like)
-            opened = [base_of(n) for n, parts in open_masses(problem).items() if own in parts]
-            masses = " and ".join(name for name in opened if name in task.parameter_names)
-            data += [
-                f"response to a {self.lengthening}" + f" ({masses} {FITTED_TOO})" * bool(masses)
-            ]
-        return _task_in_words(task, kind), ", ".join(data)
-
     def like(self, problem: FitProblem) -> Part:
         """For the package itself: the part of a fit's problem that belongs to `target` (by default
         the first), whose task, segments and settings the design takes over.
@@ -147,45 +119,10 @@ class Design(eqx.Module):
         return problem.parts[0 if self.target is None else names.index(self.target)]
 
 
-def describe_data(problem: FitProblem) -> tuple[str, str]:
-    """Tasks and data of a fit in words."""
-    tasks, told = [], []
-    for part in problem.parts:
-        target, bins, data = part.target, len(part.target.bins), []
-        if bins and target.segments is not None:
-            data += [_spectrum_in_words(target.segments, target.settings)]
-        elif bins:
-            data += [f"{bins} bins with a stated sigma"]
-        data += ["coefficient of variation"] * (part.variation is not None)
-        data += ["mean"] * (part.mean is not None)
-        if part.points is not None:
-            data += [f"dynamic stiffness at {len(part.points)} frequencies"]
-        whose = f"{part.name}: " * (len(problem.parts) > 1)
-        tasks.append(whose + _task_in_words(part.task))
-        told.append(whose + ", ".join(data))
-    return "; ".join(tasks), "; ".join(told)
-
-
-def _task_in_words(task: AbstractTask, kind: type[AbstractTask] | None = None) -> str:
-    kind = kind or type(task)
-    inputs = [
-        f"{name} = {value:.3g} {'m' if name == 'x_z' else 'N'}"
-        for name, value in _inputs(task, INPUTS).items()
-    ]
-    return ", ".join([kind.__name__ + (f" ({HELD[kind]})" if kind in HELD else ""), *inputs])
-
-
 def _inputs(task: AbstractTask, names: Iterable[str]) -> dict[str, float]:
     """Those among these inputs of a task that are not zero."""
     values = {name: float(task[name]) for name in names if name in task.parameter_names}
     return {name: value for name, value in values.items() if value != 0}
-
-
-def _spectrum_in_words(counts: tuple[int, ...], settings: SpectrumSettings) -> str:
-    length = sum(settings.length + (count - 1) * settings.step for count in counts if count)
-    alike = len(counts) > 2 and min(counts) == max(counts)
-    listed = f"{len(counts)} x {max(counts)}" if alike else " + ".join(map(str, counts))
-    return f"spectrum of {listed} segments ({length / settings.rate:.3g} s)"
 
 
 def segments_of(target: Target) -> tuple[int, ...]:

@@ -1,7 +1,6 @@
 """What the data of a fit determine, and which further measurement would determine the rest."""
 
 import dataclasses
-import itertools
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -30,10 +29,9 @@ from ._design_information import (
     with_open_masses,
     without_scalars,
 )
-from ._designs import Design, describe_data, designs_for, without_noise
+from ._designs import Design, designs_for, without_noise
 from ._identifiability_report import (
     NO_NOISE,
-    TOGETHER,
     UNDESCRIBED,
     IdentifiabilityReport,
     Known,
@@ -92,19 +90,13 @@ def identifiability(
                 raise ValueError(f"designs: two are called {name!r}: rename one")
         here = Here.of(problem, seen, result.derived_names, len(at))
         added = [_information_in(problem, theta, design) for design in tried]
-    task, data = describe_data(fitted)
-    present = here.outlook(0.0, name="the present data", task=task, data=data)
-    alone = []
-    for design, (more, failed) in zip(tried, added, strict=True):
-        task, data = design.describe(fitted)
-        about = {"task": task, "data": data, "separate": design.separate, "failed": failed}
-        alone += [here.outlook(more, present, design.moves, name=design.name, **about)]
-    possible = [(d, x) for d, (x, failed) in zip(tried, added, strict=True) if failed is None]
-    pairs = [
-        here.outlook(x + y, present, a.moves or b.moves, name=a.name + TOGETHER + b.name)
-        for (a, x), (b, y) in itertools.combinations(possible, 2)
+    present = here.outlook(0.0, name="the present data")
+    alone = [
+        here.outlook(
+            more, present, design.moves, name=design.name, separate=design.separate, failed=failed
+        )
+        for design, (more, failed) in zip(tried, added, strict=True)
     ]
-    pairs.sort(key=lambda pair: (-len(pair.gained), pair.log_left))
     notices = tuple(n for n in result.notices if " ambiguous: " in n)
     notices += (NO_NOISE,) * (designs is None and without_noise(fitted))
     # Of another target the fit has said nothing.
@@ -116,7 +108,6 @@ def identifiability(
         names,
         present,
         tuple(alone),
-        tuple(pairs),
         (misfit_notices(result) if target is None else ()) + notices,
         result.derived[MEAN].value if result.per_newton else None,
         tuple(n for n, p in found.items() if n in known and p.stderr is None),
@@ -210,7 +201,7 @@ class Here(NamedTuple):
         self, more: Any, present: Outlook | None = None, masses: bool = False, **about: Any
     ) -> Outlook:
         """What is known with `more` information; the further masses are known, too, unless they are
-        asked to be open. `about`, the design in words."""
+        asked to be open. `about`, further fields."""
         size, free, c = len(self.prior) if masses else self.free, self.free, self.coordinates
         own = np.s_[:size, :size]
         after = np.linalg.pinv((self.information + more + self.prior)[own], hermitian=True)
@@ -232,5 +223,6 @@ class Here(NamedTuple):
             products={n: float(np.sqrt(g @ inner @ g)) for n, g in products.items()},
             quantities=known,
             gained=tuple(n for n, k in known.items() if k.determined and not had[n].determined),
+            masses_open=masses,
             **about,
         )

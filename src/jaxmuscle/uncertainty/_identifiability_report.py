@@ -4,7 +4,6 @@ words and tables."""
 import dataclasses
 import re
 import textwrap
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
 
 
 COLUMNS, CELL = 4, 6  # designs beside each other, letters
-PAIRS_TOLD = 3
-TOGETHER = " together with "
 SAME = 1e-6
 FAR = 999  # percent
 Names = tuple[str, ...]
@@ -45,16 +42,15 @@ WORDS = {
         "known here, but not determined in the fit: {names}. The fit is stricter: it also looks for"
         " other solutions, and at combinations that are open. Believe the fit"
     ),
-    "most": "most would be learnt from {what}: {rest}",
+    "most": "most would be learnt from {letter}, {name}: {rest}",
     "open": "{count} of {free} combinations would stay open",
     "closed": "nothing would stay open",
-    "single": ". If you make only one: {letter} ({count} would stay open)",
     "design": "{design} ({count} of {free} combinations determined)",
     "tiring": (
         "fatigue is not considered: split a long or strong hold into short trials with rests"
         " between, and give all trials to one fit"
     ),
-    "separate": "; with its own {values} of {names}",
+    "separate": "; with its own values of {names}",
     "errors": (
         "standard errors in percent of the value. In brackets: not determined, since about a third"
         " or more of the error without data is left{doubted}. >>: {far} % or more. prior: without"
@@ -67,14 +63,13 @@ WORDS = {
         " mean force (that of the fitted muscle is {force:.3g} N)"
     ),
     "masses": "taken as known, as in the fit: {masses}{opened}",
-    "opened": "; but fitted in those measurements whose details say so",
+    "opened": "; but fitted in a record of a moved insertion",
 }
 NO_NOISE = (
     "no further measurement is tried: the fit has no spectrum, so the noise that limits a"
     " measurement is not known. Fit the recording of both channels, or a spectrum beside the"
     " response (fit of several targets)"
 )
-FITTED_TOO = "fitted in this measurement"
 BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
 
 
@@ -110,17 +105,18 @@ class Known(eqx.Module):
 
 
 class Outlook(Printed, Result, eqx.Module):
-    """What is known with the data of a design, or of several, added to the present ones.
+    """What is known with the data of a design added to the present ones.
 
-    `task` and `data` in words; `separate`, the parameters that have other values there;
-    `singular_values`: by how many of their standard errors the data move if the parameters change
-    by a standard deviation of the prior along each direction; `determined`, how many directions are
-    (singular value at least 3); `undetermined`, sentences: what can be scaled together unnoticed;
-    `products` and ratios of parameters that are determined, with their relative standard errors;
-    `quantities` by name, each with `value`, `unit`, `stderr` by data and prior, `prior_sd` by the
-    prior alone, and whether it is `determined` (at most a tenth of the prior's variance is left);
-    `gained`, those that become determined; `failed`, why the design is impossible, or None. An
-    impossible design adds nothing: its numbers are those of the present data.
+    `separate`, the parameters that have other values there; `masses_open`, whether the masses are
+    fitted with it; `singular_values`: by how many of their standard errors the data move if the
+    parameters change by a standard deviation of the prior along each direction; `determined`, how
+    many directions are (singular value at least 3); `undetermined`, sentences: what can be scaled
+    together unnoticed; `products` and ratios of parameters that are determined, with their relative
+    standard errors; `quantities` by name, each with `value`, `unit`, `stderr` by data and prior,
+    `prior_sd` by the prior alone, and whether it is `determined` (at most a tenth of the prior's
+    variance is left); `gained`, those that become determined; `failed`, why the design is
+    impossible, or None. An impossible design adds nothing: its numbers are those of the present
+    data.
     """
 
     name: str
@@ -130,9 +126,8 @@ class Outlook(Printed, Result, eqx.Module):
     products: dict[str, float]
     quantities: dict[str, Known]
     gained: Names
-    task: str = ""
-    data: str = ""
     separate: Names = ()
+    masses_open: bool = False
     failed: str | None = None
 
     @property
@@ -161,34 +156,24 @@ UNDESCRIBED = "the fit does not describe its data"
 
 
 class IdentifiabilityReport(Printed, Result, eqx.Module):
-    """What the data of a fit determine (`present`), and what they would with further `designs` or
-    `pairs` of these.
+    """What the data of a fit determine (`present`), and what they would with each of further
+    `designs`.
 
-    `target` and `free` name the data and the fitted parameters; the pairs are sorted, best first;
-    `notices` of the fit; `mean_force` [N] of the fitted muscle where the data have no newtons:
-    print states values per newton of it, as the fit does, and `to_dict` in newtons; `open_in_fit`,
-    what is determined here and was not in the fit, which is stricter; `masses` [kg] that are taken
-    as known.
+    `target` and `free` name the data and the fitted parameters; `notices` of the fit; `mean_force`
+    [N] of the fitted muscle where the data have no newtons: print states values per newton of it,
+    as the fit does, and `to_dict` in newtons; `open_in_fit`, what is determined here and was not in
+    the fit, which is stricter; `masses` [kg] that are taken as known.
     """
 
     target: str
     free: Names
     present: Outlook
     designs: tuple[Outlook, ...]
-    pairs: tuple[Outlook, ...]
     notices: Names
     mean_force: float | None = None
     open_in_fit: Names = ()
     masses: dict[str, float] = eqx.field(default_factory=dict)
 
-    @property
-    def telling_pairs(self) -> tuple[Outlook, ...]:
-        """Pairs after which more quantities become determined than after any single design, best
-        first."""
-        most = max((len(design.gained) for design in self.designs), default=0)
-        return tuple(pair for pair in self.pairs if len(pair.gained) > most)
-
-    together: ClassVar[str] = TOGETHER
     threshold: ClassVar[float] = DETERMINED
 
     @staticmethod
@@ -216,7 +201,6 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
             "threshold": DETERMINED,
             "present": self.present.to_dict(),
             "designs": [d.to_dict() for d in self.designs],
-            "pairs": [d.to_dict() for d in self.pairs],
             "notices": list(self.notices),
             "not_determined_in_fit": list(self.open_in_fit),
             "masses": self.masses,
@@ -228,7 +212,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
         Columns: `design`, `quantity`, `value`, `unit`, `stderr`, `prior_sd`, `determined`, and
         `left`, the share of the prior's standard deviation that is left.
         """
-        known = [("", self.present), *((o.name, o) for o in (*self.designs, *self.pairs))]
+        known = [("", self.present), *((o.name, o) for o in self.designs)]
         return frame(
             [
                 {"design": design, "quantity": name, **quantity.row()}
@@ -246,7 +230,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
         return plot.identifiability(self, ax)
 
     def __str__(self) -> str:
-        return "\n".join([*_present(self), *_next(self), *_table(self), *_details(self)])
+        return "\n".join([*_present(self), *_next(self), *_table(self)])
 
 
 def names_to_show(quantities: dict[str, Known]) -> list[str]:
@@ -287,7 +271,6 @@ def _item(text: str) -> list[str]:
 def _present(report: IdentifiabilityReport) -> list[str]:
     now, count = report.present, report.present.determined
     lines = _wrapped(WORDS["heading"].format(target=report.target), 2, "")
-    lines += _wrapped(f"{now.task}; {now.data}", 2)
     for notice in report.notices:
         lines += _wrapped(notice, 4, "  note: ")
     about = {"count": count, "free": len(report.free), "threshold": DETERMINED}
@@ -320,45 +303,20 @@ def _next(report: IdentifiabilityReport) -> list[str]:
         return []
     free = len(report.free)
     lines = ["  what to measure next:"]
-    if (best := _most(report, (*report.designs, *report.pairs))) is not None:
+    if (number := _most(report.designs)) is not None:
+        best = report.designs[number]
         count = free - best.determined
         rest = WORDS["open" if count else "closed"].format(count=count, free=free)
-        named = dict(zip(_letters(report, best), best.name.split(TOGETHER), strict=False))
-        what = ", ".join([*named, best.name])
-        if len(named) > 1:
-            what = TOGETHER.join(f"{at} ({name})" for at, name in named.items())
-            if (single := _most(report, report.designs)) is not None:
-                (first,), count = _letters(report, single), free - single.determined
-                rest += WORDS["single"].format(letter=first, count=count)
-        lines += _wrapped(WORDS["most"].format(what=what, rest=rest), 4)
+        about = {"letter": letter(number), "name": best.name, "rest": rest}
+        lines += _wrapped(WORDS["most"].format(**about), 4)
     for number, design in enumerate(report.designs):
         words = "{design}" if design.failed else WORDS["design"]
         about = {"design": design, "count": design.determined, "free": free}
-        lines += _wrapped(words.format(**about), 8, f"    {letter(number):<2}  ")
-    for pair in report.telling_pairs[:PAIRS_TOLD]:
-        label = "+".join(_letters(report, pair))
-        lines += _wrapped(str(pair).replace(pair.name, "both together"), 8, f"    {label:<3} ")
+        line = words.format(**about)
+        if design.separate:
+            line += WORDS["separate"].format(names=", ".join(design.separate))
+        lines += _wrapped(line, 8, f"    {letter(number):<2}  ")
     return lines + _wrapped(WORDS["tiring"], 4)
-
-
-def _letters(report: IdentifiabilityReport, outlook: Outlook) -> list[str]:
-    """The letters of a design, or of the two of a pair."""
-    letters = {design.name: letter(i) for i, design in enumerate(report.designs)}
-    names = [outlook.name] if outlook.name in letters else outlook.name.split(TOGETHER)
-    return [at for name, at in letters.items() if name in names]
-
-
-def _details(report: IdentifiabilityReport) -> list[str]:
-    """Task and data of each measurement."""
-    lines = ["  the measurements in detail:"] if report.designs else []
-    for number, design in enumerate(report.designs):
-        values, names = (
-            "values" if len(design.separate) > 1 else "value",
-            ", ".join(design.separate),
-        )
-        own = WORDS["separate"].format(values=values, names=names) * bool(design.separate)
-        lines += _wrapped(f"{design.task}; {design.data}{own}", 8, f"    {letter(number):<2}  ")
-    return lines
 
 
 def _table(report: IdentifiabilityReport) -> list[str]:
@@ -372,7 +330,7 @@ def _table(report: IdentifiabilityReport) -> list[str]:
         lines += _item(WORDS["per newton"].format(force=report.mean_force))
     elif report.masses:
         masses = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
-        opened = WORDS["opened"] * any(FITTED_TOO in outlook.data for outlook in report.designs)
+        opened = WORDS["opened"] * any(design.masses_open for design in report.designs)
         lines += _item(WORDS["masses"].format(masses=masses, opened=opened))
     wide = max(24, *(1 + len(name) for name in report.names))
     # two more stand before them
@@ -410,13 +368,11 @@ def _cell(known: Known, error: float, determined: bool) -> str:
     return cell if determined else f"({cell})"
 
 
-def _most(report: IdentifiabilityReport, outlooks: Iterable[Outlook]) -> Outlook | None:
-    """What determines most; among equals one measurement before two, then that with the smaller
-    errors."""
-    alone = {design.name for design in report.designs}
-    possible = [outlook for outlook in outlooks if outlook.failed is None]
-    return max(
-        possible,
-        key=lambda o: (o.determined, len(o.gained), o.name in alone, -o.log_left),
-        default=None,
-    )
+def _most(designs: tuple[Outlook, ...]) -> int | None:
+    """Number of the design that determines most; among equals that with the smaller errors."""
+    ranks = {
+        number: (design.determined, len(design.gained), -design.log_left)
+        for number, design in enumerate(designs)
+        if design.failed is None
+    }
+    return max(ranks, key=lambda number: ranks[number], default=None)

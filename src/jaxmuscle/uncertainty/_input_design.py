@@ -1,16 +1,16 @@
 """The motion of the insertion from which a quantity becomes best known."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple, Unpack
 
 import jax
 import numpy as np
 import scipy
 from jaxtyping import Float
 
+from jaxmuscle._common.arguments import check_options
 from jaxmuscle._common.arrays import as_numbers, require
-from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle._common.keys import check_key, key_of
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Key
@@ -31,39 +31,28 @@ from ._design_information import (
     expansion_at,
     with_open_masses,
 )
-from ._designed_input import DOUBTFUL, DesignedInput
+from ._designed_input import DesignedInput
 from ._designs import moved_insertion, without_noise
 from ._identifiability import LEAST_PRIOR, Here, fitted_problem, misfit_notices
 from ._identifiability_report import BASE, NO_NOISE
-from ._lengthening import Largest, Lengthening, Lines, Samples, lines_in, require_positive
-from ._multisine import multisine, speed_of
+from ._lengthening import Largest, Lengthening, Lines
+from ._multisine import Motion, MotionOptions
 
 WIDTH, FEWEST = 0.15, 5  # of a step of the density: relative to its frequency; lines in it at least
 TRIES = 4  # how often the density follows the crest factors of its motion
 CREST = (1.6, 2.0, 2.5)  # of position, velocity and acceleration, to begin with
-ENOUGH = 1e-6
-MOST = 10**8  # samples of a motion
 LONGEST = 1e4  # times the record
-LEAST_SECONDS = 8.0  # of a record, as a fit asks for
 NOTHING = 1e-4  # of the relative variance, by which a motion must lower it
 
 
-def design_input(  # noqa: PLR0913 (options of a public call)
+def design_input(
     result: FitResult | AbstractTask,
     quantity: str | Iterable[str] = "K_w0",
     *,
-    rms: float = 1e-3,
-    band: tuple[float, float] = (0.5, 5.0),
-    seconds: float = 60.0,
-    rate: float = 1000.0,
-    peak: float | None = None,
-    speed: float | None = None,
-    acceleration: float | None = None,
-    spread: float = 0.1,
     target: str | None = None,
     key: Key = 0,
-    durations: Iterable[float] = (),
     error: float | None = None,
+    **options: Unpack[MotionOptions],
 ) -> DesignedInput:
     """The motion of the insertion, within limits, whose record makes a quantity best known.
 
@@ -99,8 +88,6 @@ def design_input(  # noqa: PLR0913 (options of a public call)
       be foreseen, and would not test the model)
     - `target`: of a fit with several targets, the one whose task and spectrum settings the new
       record takes over (by default the first)
-    - `durations` [s]: lengths of the record for which the errors are told, too, the motion being
-      repeated
     - `error`: relative, 0.1 say: how long a record takes until every quantity is known to that
 
     **Raises:** `ValueError` for an unknown quantity or one that is fixed, or of which no motion
@@ -108,108 +95,47 @@ def design_input(  # noqa: PLR0913 (options of a public call)
     rate, seconds that are no whole number of samples; `OperatingPointError` for a task without
     linear response.
     """
-    positive = {
-        "rms": (rms, "m"),
-        "peak": (peak, "m"),
-        "speed": (speed, "m/s"),
-        "acceleration": (acceleration, "m/s²"),
-        "rate": (rate, "Hz"),
-    }
-    for name, (value, unit) in positive.items():
-        if value is not None:
-            require_positive(name, value, unit)
-    require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
-    durations = [float(one) for one in durations]
-    require(
-        seconds >= LEAST_SECONDS,
-        f"seconds = {seconds}: give at least {LEAST_SECONDS:g} s, since less holds no spectrum",
-    )
-    for one in durations:
-        require_positive("durations", one, "s")
+    check_options(design_input, MotionOptions, options)
+    asked = Motion(**options)
     require(
         error is None or 0 < error < 1,
         f"error = {error} must be a share between 0 and 1, 0.1 for 10 %",
     )
     check_key(key)
-    frequency, samples = lines_in(band, seconds), _samples(seconds, rate)
-    require(
-        2 * frequency[-1] < rate,
-        f"band = {band} Hz reaches beyond half of rate = {rate} Hz: raise the rate",
-    )
     quantities = (quantity,) if isinstance(quantity, str) else tuple(quantity)
-    limits = np.array([np.inf if limit is None else limit for limit in (peak, speed, acceleration)])
-    crest = np.array(CREST)
+    crest, rms = np.array(CREST), [asked.rms, np.inf, np.inf]
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_of(key))).tolist())
-
-    def realise(power: Lines) -> tuple[Samples, Largest]:
-        """A motion of these lines, made smaller where it must be, and the crest factors of it and
-        its derivatives."""
-        motion = multisine(frequency * seconds, power, seconds, samples, limits, rng)
-        velocity = speed_of(motion, seconds)
-        moved = np.stack([motion, velocity, speed_of(velocity, seconds)])
-        tops = np.max(np.abs(moved), axis=1)
-        return motion * min(1.0, *(limits / tops)), tops / np.sqrt(np.mean(moved**2, axis=1))
-
     with jax.enable_x64(True):
-        even = Lengthening.flat(rms, band, seconds)
+        even = Lengthening.flat(asked.rms, asked.band, asked.seconds)
         experiment = Experiment.of(result, quantities, even, target)
-        motion = realise(even.power)[0]
-        even = even.of_motion(motion)
+        displacement, _ = asked.realise(even.power, rng)
+        even = even.of_motion(displacement)
         # What limits a motion are its peaks, which follow from its density: both in turn.
-        for _ in range(TRIES if np.isfinite(min(limits)) else 1):
-            allowed = np.minimum(limits / crest, [rms, np.inf, np.inf])
-            motion, crest = realise(experiment.best(allowed, spread))
-        own, wider = even.of_motion(motion), None
-        if 4 * band[1] < rate:
-            wide = Lengthening.flat(rms, (band[0], 2 * band[1]), seconds).within(limits / crest)
-            wider = 2.0 * band[1], experiment.errors(wide.power, lines=experiment.by_line(wide))
-        now, known = experiment.errors(None), experiment.here.values
-        others = {
-            n: tuple(
-                _elsewhere(result, n, even, target, own.power, side * experiment.towards(n))
-                for side in (-1, 1)
-            )
-            for n in experiment.quantity
-            if now[n] > DOUBTFUL * abs(known[n][0])
-        }
-    return DesignedInput(
-        experiment.quantity,
-        own,
-        even,
-        motion,
-        float(rate),
-        values={n: value for n, (value, _) in known.items()},
-        units={n: unit for n, (_, unit) in known.items()},
-        prior=experiment.by_prior(),
-        now=now,
-        flat=experiment.errors(even.power),
-        stderr=experiment.errors(own.power),
-        by_seconds={one: experiment.errors(own.power, one / seconds) for one in durations},
-        needed=None
-        if error is None
-        else (float(error), seconds * experiment.times_for(own.power, error)),
-        notices=misfit_notices(result) if isinstance(result, FitResult) else (),
-        elsewhere=others,
-        masses=experiment.masses,
-        held=experiment.held,
-        wider=wider,
-        moved=experiment.moved,
-        allowed=(rms, *limits.tolist()),
-    )
-
-
-def _samples(seconds: float, rate: float) -> int:
-    """Of one period."""
-    require(
-        seconds * rate <= MOST,
-        f"seconds = {seconds} at rate = {rate} Hz are more than {MOST} samples: make it shorter",
-    )
-    samples = round(seconds * rate)
-    require(
-        abs(samples - seconds * rate) < ENOUGH * samples,
-        f"seconds = {seconds}: rate = {rate} Hz makes no whole number of samples of it",
-    )
-    return samples
+        for _ in range(TRIES if np.isfinite(min(asked.limits)) else 1):
+            power = experiment.best(np.minimum(asked.limits / crest, rms), asked.spread)
+            displacement, crest = asked.realise(power, rng)
+        own, known = even.of_motion(displacement), experiment.here.values
+        length = None
+        if error is not None:
+            length = error, asked.seconds * experiment.times_for(own.power, error)
+        return DesignedInput(
+            experiment.quantity,
+            asked,
+            own,
+            even,
+            displacement,
+            values={n: value for n, (value, _) in known.items()},
+            units={n: unit for n, (_, unit) in known.items()},
+            prior=experiment.by_prior(),
+            now=experiment.errors(None),
+            flat=experiment.errors(even.power),
+            stderr=experiment.errors(own.power),
+            needed=length,
+            notices=misfit_notices(result) if isinstance(result, FitResult) else (),
+            masses=experiment.masses,
+            held=experiment.held,
+            moved=experiment.moved,
+        )
 
 
 def _full_name(name: str, known: Mapping[str, Any], targets: Iterable[str | None]) -> str:
@@ -218,23 +144,6 @@ def _full_name(name: str, known: Mapping[str, Any], targets: Iterable[str | None
     return next(
         (n for n in (name, *(f"{name}@{target}" for target in targets)) if n in known), name
     )
-
-
-def _elsewhere(
-    given: FitResult | AbstractTask,
-    name: str,
-    record: Lengthening,
-    target: str | None,
-    power: Lines,
-    step: Theta,
-) -> tuple[float, float]:
-    """A quantity's value a step away from the fit, and the standard error there with a motion; nan
-    where no muscle is."""
-    try:
-        there = Experiment.of(given, (name,), record, target, step)
-    except OperatingPointError:
-        return np.nan, np.nan
-    return there.here.values[name][0], there.errors(power)[name]
 
 
 class Experiment(NamedTuple):
@@ -249,7 +158,6 @@ class Experiment(NamedTuple):
     start: Square
     apart: Square
     frequency: Lines
-    by_line: Callable[[Lengthening], Float[np.ndarray, "lines free free"]]
     lines: Float[np.ndarray, "lines free free"]
     moved: bool
 
@@ -260,20 +168,14 @@ class Experiment(NamedTuple):
         quantity: Iterable[str],
         record: Lengthening,
         target: str | None,
-        step: Theta | None = None,
     ) -> "Experiment":
-        """Of a record, at the values of a fit or task, or a step of its θ away from them. Needs
-        double precision."""
+        """Of a record, at the values of a fit or task. Needs double precision."""
         fitted, theta, derived = _problem(given)
         if without_noise(fitted):
             raise ValueError(f"result: {NO_NOISE}")
         fitted = dataclasses.replace(fitted, parts=tuple(map(_held_by_motor, fitted.parts)))
         problem = with_open_masses(fitted)
         theta = np.append(theta, np.zeros(len(problem.prior) - len(theta)))
-        if step is not None:
-            theta = theta + step
-            parts = (dataclasses.replace(part, task=part.task_at(theta)) for part in problem.parts)
-            problem = dataclasses.replace(problem, parts=tuple(parts))
         tangents = problem.by_name(
             [dict.fromkeys(TANGENTS if has_tangents(part.task) else ()) for part in problem.parts]
         )
@@ -294,12 +196,8 @@ class Experiment(NamedTuple):
         start = np.diag(prior) + (here.information if isinstance(given, FitResult) else 0.0)
         still = dataclasses.replace(design, task=task, lengthening=None)
         own, coordinates = coordinates_of(like, theta, task)
-
-        def by_line(record: Lengthening) -> np.ndarray:
-            lines = np.zeros((len(record.frequency), *start.shape))
-            lines[:, own[:, None], own] = record.by_line(task, coordinates, theta[own])
-            return lines
-
+        lines = np.zeros((len(record.frequency), *start.shape))
+        lines[:, own[:, None], own] = record.by_line(task, coordinates, theta[own])
         fixed = set(MASSES) - set(design.like(fitted).coordinates.names)
         masses = {n: float(task[n]) for n in MASSES if n in fixed and n in task.parameter_names}
         return cls(
@@ -311,8 +209,7 @@ class Experiment(NamedTuple):
             start,
             start + design_information(problem, theta, still),
             record.frequency,
-            by_line,
-            by_line(record),
+            lines,
             bool(moved),
         )
 
@@ -362,15 +259,12 @@ class Experiment(NamedTuple):
         )
         return rms**2 * np.maximum(found.x, 0) @ steps
 
-    def errors(
-        self, power: Lines | None, times: float = 1.0, lines: np.ndarray | None = None
-    ) -> dict[str, float]:
+    def errors(self, power: Lines | None, times: float = 1.0) -> dict[str, float]:
         """Standard errors of all quantities with a motion, if the record is so many `times` as
-        long; without it if None. `lines`, of other frequencies than the record's."""
+        long; without it if None."""
         record: Any = 0.0
         if power is not None:
-            motion = np.tensordot(power, self.lines if lines is None else lines, 1)
-            record = self.apart - self.start + motion
+            record = self.apart - self.start + np.tensordot(power, self.lines, 1)
         after = np.linalg.pinv(self.start + times * record, hermitian=True)
         return {name: float(np.sqrt(g @ after @ g)) for name, g in self.here.gradients.items()}
 
@@ -379,16 +273,6 @@ class Experiment(NamedTuple):
         before = 1 / np.maximum(self.prior, LEAST_PRIOR)
         gradients = self.here.gradients.items()
         return {name: float(np.sqrt(np.sum(before * g**2))) for name, g in gradients}
-
-    def towards(self, name: str) -> Theta:
-        """The step `Σ g / √(gᵀ Σ g)` of the fit's θ to the likeliest muscle in which a quantity is
-        a standard error larger.
-
-        Σ is the covariance by what is known without the record.
-        """
-        g = self.here.gradients[name]
-        far = np.linalg.pinv(self.start, hermitian=True) @ g
-        return far / np.sqrt(g @ far)
 
     def times_for(self, power: Lines, error: float) -> float:
         """How many times as long a record must be for a relative error of every quantity; infinite

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmuscle._common.arguments import positive
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.programs import kept
@@ -26,16 +27,10 @@ Samples = Float[np.ndarray, " samples"]
 Largest = Float[np.ndarray, "3"]
 
 
-def require_positive(name: str, value: float, unit: str) -> None:
-    """Raises `ValueError` for a number that is not positive and finite."""
-    if not 0 < value < np.inf:
-        raise ValueError(f"{name} = {value} {unit} must be a positive number")
-
-
 def lines_in(band: tuple[float, float], seconds: float) -> Lines:
     """Multiples of 1 / seconds [Hz] in a band, both ends included. Raises `ValueError` if there is
     none."""
-    require_positive("seconds", seconds, "s")
+    positive("seconds", seconds)
     low, high = band
     first, last = np.ceil(low * seconds - WHOLE), np.floor(high * seconds + WHOLE)
     if not (0 < first <= last):
@@ -68,19 +63,9 @@ class Lengthening(Printed, Result, eqx.Module):
     def flat(cls, rms: float, band: tuple[float, float], seconds: float = 60.0) -> "Lengthening":
         """Of `rms` [m], the same density at all frequencies of a `band` [Hz]. Raises `ValueError`
         for an impossible one."""
-        require_positive("rms", rms, "m")
+        positive("rms", rms)
         lines = lines_in(band, seconds)
         return cls(lines, np.full(len(lines), rms**2 / len(lines)), seconds)
-
-    def within(self, most: Largest) -> "Lengthening":
-        """Made smaller, so that displacement [m], speed [m/s] and acceleration [m/s²] are at most
-        so large (rms)."""
-        share = min(1.0, *(most / [self.rms_of(order) for order in range(3)]))
-        return Lengthening(self.frequency, self.power * share**2, self.seconds)
-
-    def rms_of(self, order: int) -> float:
-        """Root of the mean square of the displacement's derivative of that order."""
-        return float(np.sqrt(np.sum((2 * np.pi * self.frequency) ** (2 * order) * self.power)))
 
     def of_motion(self, displacement: Samples) -> "Lengthening":
         """One of the same frequencies, with the power of `displacement` [m], one period of a
@@ -92,7 +77,7 @@ class Lengthening(Printed, Result, eqx.Module):
     @property
     def rms(self) -> float:
         """Root of the mean square [m]."""
-        return self.rms_of(0)
+        return float(np.sqrt(np.sum(self.power)))
 
     def __str__(self) -> str:
         moved = self.frequency[self.power > 0]

@@ -1,20 +1,21 @@
 """The posterior of a fit's parameters: Hamiltonian chains, what they say, and whether they may be
 believed."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
+from typing import Unpack
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
-from jaxmuscle._common.arguments import require_extra
+from jaxmuscle._common.arguments import check_options, require_extra
 from jaxmuscle._common.environment import fitting, versions
 from jaxmuscle._common.keys import fold_in, number_of
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._reopened import bounds_of, reopened
+from jaxmuscle.fits._reopened import ReopenOptions, bounds_of, reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._arguments import settings_of
 from jaxmuscle.objective._consequences import expand, quantities
@@ -32,7 +33,7 @@ ROWS = 256
 DRAWS = 600, 800, 1100, 1600, 2300, 3000
 
 
-def posterior(  # noqa: PLR0913 (options of a public call)
+def posterior(
     result: FitResult,
     target: Target | None = None,
     *,
@@ -40,10 +41,8 @@ def posterior(  # noqa: PLR0913 (options of a public call)
     chains: int = 4,
     draws: int | None = None,
     warmup: int = 400,
-    free: Iterable[str] | None = None,
-    priors: Mapping[str, float | tuple[float, float | None] | None] | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
     progress: bool | Callable[[str, float], None] = False,
+    **options: Unpack[ReopenOptions],
 ) -> Posterior:
     """Draw from the posterior of a fit's parameters in linear response, by Hamiltonian Monte Carlo
     from dispersed starts.
@@ -81,6 +80,7 @@ def posterior(  # noqa: PLR0913 (options of a public call)
     **Source:** Neal 2011, arXiv:1206.1901 (Hamiltonian Monte Carlo, trajectories of random length);
     Vehtari et al. 2021, doi:10.1214/20-BA1221 (R-hat, effective sample size).
     """
+    check_options(posterior, ReopenOptions, options)
     require_extra("posterior")
     lengths = DRAWS if draws is None else (draws,)
     for name, count, least in (
@@ -91,8 +91,8 @@ def posterior(  # noqa: PLR0913 (options of a public call)
         if count < least:
             raise ValueError(f"{name} = {count} must be at least {least}")
     with told(progress, f"posterior of {result.title}") as tell, fitting():
-        problem = reopened(result, target, free=free, priors=priors, bounds=bounds, key=key)
-        limits = bounds_of(result, problem.coordinates.names, bounds)
+        problem = reopened(result, target, key=key, **options)
+        limits = bounds_of(result, problem.coordinates.names, options.get("bounds"))
         likelihood = Likelihood.of(problem)
         tell("searching the most probable parameters", 0.0)
         density, _, _ = density_about(
@@ -154,8 +154,7 @@ def _report(
         task = part.task.replace(
             **{n: float(np.median(own[:, j])) for j, n in enumerate(part.coordinates.names)}
         )
-        shared = {n: names[c] for n, c in zip(part.coordinates.names, part.columns, strict=True)}
-        parts[name] = PosteriorPart(part.target, task, drawn, shared)
+        parts[name] = PosteriorPart(part.target, task, drawn)
     return Posterior(
         success,
         message,

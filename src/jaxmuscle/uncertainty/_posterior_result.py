@@ -50,14 +50,11 @@ class PosteriorPart(eqx.Module):
     `replicates` has an entry for every draw: proportional powers `expected` by the model and
     `power` drawn about it; `chi2` of the measured and `chi2_drawn` of the drawn spectrum about the
     same model; and over all draws `p_value`, how often the drawn one is further away.
-
-    `names` {parameter of the task: name among the samples}.
     """
 
     target: Target
     task: AbstractTask
     replicates: Replicates
-    names: dict[str, str]
 
 
 class Posterior(Shown, eqx.Module):
@@ -67,7 +64,7 @@ class Posterior(Shown, eqx.Module):
     `success` and `message`: whether the chains mixed, or why not; `parts`, a `PosteriorPart` for
     each target by name; `samples` of the free parameters and `derived` quantities in the units of
     the table of parameters; `diagnostics` {name: (R-hat, effective size of the bulk, of the
-    tails)}; `determined`, the names that the data determine; `frequency_modes` {harmonic frequency:
+    tails)}; `determined`, the names that the data determine; `modes` {harmonic frequency:
     ((from, median, to, probability), ...)}, of each mode its lowest draw, median and highest draw
     [Hz], and its share of the draws; `chains`, how the draws were made, with fields for every draw:
     `s`, its values in the sampler's own unbounded coordinates (`samples` has the same draw in
@@ -85,7 +82,7 @@ class Posterior(Shown, eqx.Module):
     derived: Drawn
     diagnostics: dict[str, tuple[float, float, float]]
     determined: tuple[str, ...]
-    frequency_modes: dict[str, Modes]
+    modes: dict[str, Modes]
     chains: Chains
     settings: dict[str, Any]
     seed: int | None
@@ -100,14 +97,6 @@ class Posterior(Shown, eqx.Module):
     target = of_only("target", "The target.")
     task = of_only("task", "The task with the medians of the parameters.")
     replicates = of_only("replicates", "What spectra the posterior predicts.")
-
-    @property
-    def modes(self) -> Modes:
-        """Modes of the harmonic's frequency:
-
-        (lowest draw, median, highest draw, probability). Of the first where several are free.
-        """
-        return next(iter(self.frequency_modes.values()), ())
 
     @property
     def title(self) -> str:
@@ -151,17 +140,6 @@ class Posterior(Shown, eqx.Module):
         own = name.partition("@")[2]
         part = self.parts[own] if own else next(iter(self.parts.values()))
         return unit_of(name, part.task.output_unit) or "1"
-
-    def task_of(self, chain: int, draw: int, target: str | None = None) -> AbstractTask:
-        """The task with the parameters of one draw; of several targets, the named one's."""
-        part = self.only if target is None else self.parts[target]
-        values = {}
-        for name, shared in part.names.items():
-            value, middle = self.samples[shared][chain, draw], np.median(self.samples[shared])
-            # A proportional parameter keeps its ratio to the first target's.
-            ratio = 1.0 if middle == part.task[name] else part.task[name] / middle
-            values[name] = float(value * ratio)
-        return part.task.replace(**values)
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row for each draw: `chain`, `draw`, then every parameter and derived quantity;
@@ -230,7 +208,7 @@ class Posterior(Shown, eqx.Module):
     def _summary_table(self) -> dict[str, Any]:
         """What `posterior.json` holds; `summary` is null where the chains did not mix."""
         modes, p_values, about = {}, {}, {}
-        for name, found in self.frequency_modes.items():
+        for name, found in self.modes.items():
             modes[name] = [dict(zip(MODE, mode, strict=True)) for mode in found]
         for name, part in self.parts.items():
             p_values[name] = part.replicates.p_value
@@ -289,9 +267,9 @@ class Posterior(Shown, eqx.Module):
         for name, part in self.parts.items():
             whose = f"{name}: " * (len(self.parts) > 1)
             lines += [PREDICTED.format(whose, part.replicates.p_value)]
-        for name, modes in self.frequency_modes.items():
-            listed = ", ".join(f"{mode[1]:.2f} Hz ({100 * mode[3]:.0f} %)" for mode in modes)
-            lines += [f"  {name} has several modes: {listed}"] * (len(modes) > 1)
+        for name, found in self.modes.items():
+            listed = ", ".join(f"{mode[1]:.2f} Hz ({100 * mode[3]:.0f} %)" for mode in found)
+            lines += [f"  {name} has several modes: {listed}"] * (len(found) > 1)
         return folded(lines)
 
 

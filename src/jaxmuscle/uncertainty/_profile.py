@@ -1,7 +1,7 @@
 """Profile likelihood: how far one quantity can move while everything else follows."""
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
 import equinox as eqx
 import numpy as np
@@ -9,12 +9,13 @@ import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.arguments import check_options
 from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._reopened import reopened
+from jaxmuscle.fits._reopened import ReopenOptions, reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._consequences import expand, quantities
 from jaxmuscle.objective._derived import unit_of
@@ -116,9 +117,7 @@ def profile(
     *,
     with_priors: bool = False,
     level: float = 0.95,
-    free: Iterable[str] | None = None,
-    priors: Mapping[str, float | tuple[float, float | None] | None] | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
+    **options: Unpack[ReopenOptions],
 ) -> Profile:
     """Profile likelihood of a free parameter or a derived quantity, with its confidence interval.
 
@@ -143,10 +142,11 @@ def profile(
 
     **Source:** Raue et al. 2009, doi:10.1093/bioinformatics/btp358.
     """
+    check_options(profile, ReopenOptions, options)
     if not 0 < level < 1:
         raise ValueError(f"level = {level}: give a probability between 0 and 1, 0.95 say")
     with fitting():
-        problem = reopened(result, target, free=free, priors=priors, bounds=bounds)
+        problem = reopened(result, target, **options)
         names = problem.coordinates.names
         known = (*names, *(n for n in result.derived_names if n not in names))
         if name not in known:
