@@ -18,14 +18,13 @@ from handwritten import filter_matrices
 from integration import DT, EPSILONS, EVERY, STEPS
 from jaxtyping import Float
 from measure import Row, Unequal, require_equal, seconds
+from noise_paths import respond
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._expected_moments import expected_moments
-from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised
 from jaxmuscle.spectra._settings import WINDOW
@@ -92,10 +91,16 @@ def _unit_noise(normals, transition, root):
     return noise
 
 
-def draw_noise() -> Float[np.ndarray, "seeds points channels"]:
-    """Noise paths that stay the same throughout a fit."""
+def draw_normals() -> Float[np.ndarray, "seeds points 2 channels"]:
+    """The normals of the noise paths, which stay the same throughout a fit."""
+    return np.random.default_rng(0).standard_normal((SEEDS, STEPS + 1, 2, 4))
+
+
+def make_noise(
+    normals: Float[np.ndarray, "seeds points 2 channels"],
+) -> Float[np.ndarray, "seeds points channels"]:
+    """Noise paths of these normals."""
     transition, root, deviation = filter_matrices(RATE, DEFAULTS["noise_cutoff"], DT)
-    normals = np.random.default_rng(0).standard_normal((SEEDS, STEPS + 1, 2, 4))
     return deviation * _unit_noise(normals, transition, root)
 
 
@@ -182,13 +187,15 @@ def fit(target: jm.Target, noise: Float[np.ndarray, "seeds points channels"]) ->
     return Fitted(values(found.x), bool(found.success), simulations)
 
 
-def check(task: jm.model.AbstractTask, noise: Float[np.ndarray, "seeds points channels"]) -> None:
+def check(
+    task: jm.model.AbstractTask, normals: Float[np.ndarray, "seeds points 2 channels"]
+) -> None:
     """The loop must equal jaxmuscle's simulation on the same noise, and its spectrum the expected
     one within its error."""
-    forces = simulate({}, noise)
+    forces = simulate({}, make_noise(normals))
     grid, start = Grid(DT, STEPS, EVERY, reverse=False), round(WINDOW[0] * RATE)
-    paths = Realisation(values=jnp.asarray(noise))
-    ours = jax.jit(jax.vmap(lambda path: respond(as_arrays(task), path, grid, "instant")[1]))(paths)
+    each = jax.vmap(lambda rows: respond(as_arrays(task), (rows,), grid)[1])
+    ours = jax.jit(each)(jnp.asarray(normals.reshape(SEEDS, STEPS + 1, 8)))
     tolerance = EPSILONS * float(jnp.finfo(float).eps)
     difference = require_equal(
         "numba loop", forces[:, start:, None], ours[:, start:, None], tolerance
@@ -222,15 +229,16 @@ def rows() -> list[Row]:
     """Both measured targets with the default noise: all starts and checks of `jm.fit` against one
     start of the other."""
     with jax.enable_x64(True):
-        noise = draw_noise()
-        return [row for name in TARGETS for row in _compare(name, jm.load_target(name), noise)]
+        normals = draw_normals()
+        return [row for name in TARGETS for row in _compare(name, jm.load_target(name), normals)]
 
 
 def _compare(
-    name: str, target: jm.Target, noise: Float[np.ndarray, "seeds points channels"]
+    name: str, target: jm.Target, normals: Float[np.ndarray, "seeds points 2 channels"]
 ) -> list[Row]:
     task = target.task()
-    check(task, noise)
+    check(task, normals)
+    noise = make_noise(normals)
     ends: dict[str, Any] = {}
     programs = {
         OURS: lambda: ends.update(ours=jm.fit(task, target)),

@@ -1,6 +1,8 @@
 """The programs to compare with: Heun in `lax.scan`, and diffrax as its documentation shows it."""
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import diffrax as dfx
@@ -13,13 +15,20 @@ from jaxtyping import Array, Float
 
 from jaxmuscle.model import AbstractNoise, AbstractTask
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from noise_paths import draw_normals
+
 
 def drawn(
     noise: AbstractNoise, key: Any, seeds: int, steps: int
-) -> Float[Array, "seeds steps channels"]:
-    """Normals of every seed as jaxmuscle draws them; few at a time, which stay in the cache."""
+) -> Float[Array, "seeds points numbers"]:
+    """Normals of every seed as jaxmuscle draws them, see `draw_normals`; few at a time, which stay
+    in the cache."""
     return jax.lax.map(
-        lambda i: noise.draw(jax.random.fold_in(key, i), steps), jnp.arange(seeds), batch_size=8
+        lambda i: draw_normals(noise, jax.random.fold_in(key, i), steps)[0],
+        jnp.arange(seeds),
+        batch_size=8,
     )
 
 

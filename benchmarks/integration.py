@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from handwritten import band_scan, drawn, filter_matrices, stock_diffrax, white_scan
 from measure import DTYPES, Program, Row, Unequal, require_equal, seconds, speed_ratio, speeds
+from noise_paths import respond
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 
 SEEDS, DT, EVERY, STEPS = 64, 1e-3, 10, 15_000
@@ -52,9 +52,7 @@ def _against_scan(
 
     @eqx.filter_jit
     def engine(task, normals):
-        return jax.vmap(lambda z: respond(task, task.noise.realise(z, DT), GRID, "instant")[0])(
-            normals
-        )
+        return jax.vmap(lambda z: respond(task, (z,), GRID)[0])(normals)
 
     integrate = {name: eqx.filter_jit(scan) for name, scan in scans.items()}
     programs = {OURS: lambda: engine(task, normals)} | {
@@ -85,10 +83,11 @@ def white(dtype: str, repetitions: int) -> list[Row]:
     size = np.sqrt(DT / noise.rate)
 
     def vmapped(task, normals):
-        return jax.vmap(lambda z: white_scan(task, size * z, DT, EVERY))(normals)
+        return jax.vmap(lambda z: white_scan(task, size * z[1:], DT, EVERY))(normals)
 
     def seeds_last(task, normals):
-        return jnp.moveaxis(white_scan(task, size * jnp.moveaxis(normals, 0, -1), DT, EVERY), -1, 0)
+        increments = size * jnp.moveaxis(normals[:, 1:], 0, -1)
+        return jnp.moveaxis(white_scan(task, increments, DT, EVERY), -1, 0)
 
     given = eqx.filter_jit(lambda key: drawn(noise, key, SEEDS, STEPS))
     return _against_scan(

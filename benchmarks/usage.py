@@ -9,11 +9,11 @@ import numpy as np
 from handwritten import drawn
 from integration import DT, SEEDS, STEPS
 from measure import DTYPES, Row, require_equal, seconds
+from noise_paths import respond
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._parameters import DEFAULT_FREE
-from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 
 GRADIENT_SEEDS = 8
@@ -51,9 +51,7 @@ def gradients(repetitions: int) -> list[Row]:
         def spectrum(theta, normals):
             scaled = {n: task[n] * jnp.exp(theta[i]) for i, n in enumerate(DEFAULT_FREE)}
             moved = task.replace(**scaled)
-            path = jax.vmap(
-                lambda z: respond(moved, moved.noise.realise(z, DT), grid, "instant")[1]
-            )(normals)
+            path = jax.vmap(lambda z: respond(moved, (z,), grid)[1])(normals)
             power = jm.spectra.spectrum_of(path, task.settings, (5.0, 15.0)).power.mean(0)
             return power / power.sum()
 

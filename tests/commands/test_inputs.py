@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
-from jaxmuscle.paper._figures import FIGURES
 
 COMMANDS = typer.main.get_group(app).commands
 MADE = {name: command for name, command in COMMANDS.items() if not command.hidden}
@@ -40,10 +39,6 @@ READS = {
     ("identifiability", "target that is a fit"): ["fit.json", "identifiability {}"],
     ("design", "source"): ["preset.toml", "design {}"],
     ("compare", "target"): ["spectrum.csv", "compare {}"],
-    ("reproduce", "recording"): [
-        "trial.csv",
-        "reproduce --recording {} --recording {in}/trial.csv --recording {in}/trial.csv",
-    ],
     ("study", "table"): ["study.csv", "study {}"],
     ("study", "table of a .toml"): ["study.csv", "study {in}/study.toml"],
     ("study", "table that names a recording"): ["trial.csv", "study {in}/named.csv"],
@@ -117,8 +112,6 @@ def test_what_is_read_is_not_replaced(name, words, here, tmp_path, monkeypatch, 
         result = run(arguments, here, here / content, out)
         assert isinstance(result.exception, Asked), result.output
     assert named and all(path == out or out in path.parents for path in named)
-    if name == "reproduce":
-        assert {path.stem for path in named} == {*FIGURES, "index", "claims"}
     told = []
     if words == "target of several":  # a spectrum of another name has another folder
         named = [path for path in named if path.stem in ("cohort", "differences", "spectrum")]

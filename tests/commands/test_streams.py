@@ -230,7 +230,7 @@ def test_posterior_asks_for_its_extra_before_it_fits(tmp_path, monkeypatch):
         jm.posterior(made_result())
 
 
-@pytest.mark.parametrize("command", ["study", "steadiness", "analyse", "fit", "reproduce"])
+@pytest.mark.parametrize("command", ["study", "steadiness", "analyse", "fit"])
 def test_a_library_that_is_missing_is_one_sentence(command, tmp_path, monkeypatch):
     """In every command that reads recordings."""
     (tmp_path / "ezc3d.py").write_text("raise ImportError")
@@ -242,7 +242,6 @@ def test_a_library_that_is_missing_is_one_sentence(command, tmp_path, monkeypatc
     given = {
         "study": [tmp_path / "study.csv"],
         "steadiness": [tmp_path / "study.csv"],
-        "reproduce": ["--recording", path] * 3,
     }.get(command, [path])
     result = run(command, *given, "--out", tmp_path / "out")
     assert result.exit_code == 2 and f"{path}: reading C3D needs ezc3d" in result.stderr

@@ -69,7 +69,7 @@ STRUCTURES: dict[str, Any] = {
     "isometric multitaper": jm.Isometric(
         settings=Q(length=500, window="dpss", tapers=3, first_bin=2, last_bin=30)
     ),
-    "isometric pwelch": jm.Isometric(settings=Q.pwelch()),
+    "isometric pwelch": jm.Isometric(settings=Q.named("pwelch")),
     "isometric unfiltered": jm.Isometric(settings=Q(**RIGID)),
     "isometric even filter": jm.Isometric(
         settings=Q(filter_order=4, filter_cutoff=10.0, overlap=0.75, first_bin=0)

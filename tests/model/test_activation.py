@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.signal
 from compiled import at_once
+from noise_paths import unit_path
 
 import jaxmuscle as jm
 
@@ -19,6 +20,20 @@ def twitch(time):
     return (np.array([[0, 1], [-1, -2]]) / time, [[0.0], [1 / time]], np.eye(2), [[0.0], [0.0]])
 
 
+def through(activation, before, after, dt):
+    """Values and slopes of what comes out, from rest, of inputs that run straight from `before` to
+    `after` in every step."""
+    step = activation.transition(dt)
+
+    def advance(state, given):
+        return (step.advance(state, *given),) * 2
+
+    rest = jnp.zeros(before.shape[1:])
+    _, states = jax.lax.scan(advance, (rest, rest), (before, after))
+    a, b = (jnp.concatenate([rest[None], values]) for values in states)
+    return a, b / activation.time
+
+
 @pytest.mark.parametrize("time, dt", [(0.06, 1e-3), (0.002, 1e-3), (0.2, 1e-2)])
 def test_what_comes_out_is_scipys(x64, time, dt):
     """Of inputs that run straight from sample to sample, and of steps that are held."""
@@ -28,7 +43,7 @@ def test_what_comes_out_is_scipys(x64, time, dt):
         (given[:-1], given[1:], True),
         (given[:-1], given[:-1], False),
     ):
-        a, slope = activation.through(jnp.asarray(before), jnp.asarray(after), dt)
+        a, slope = through(activation, jnp.asarray(before), jnp.asarray(after), dt)
         for i in range(2):
             _, states, _ = scipy.signal.lsim(
                 twitch(time), given[:, i], seconds, interp=interpolated
@@ -42,7 +57,7 @@ def test_slopes_are_the_derivative_of_values(x64):
     for dt in (2e-3, 1e-3):
         given = jnp.asarray(np.sin(20 * dt * np.arange(round(1 / dt) + 1)))[:, None]
         a, slope = (
-            np.asarray(x)[:, 0] for x in jm.Activation(0.05).through(given[:-1], given[1:], dt)
+            np.asarray(x)[:, 0] for x in through(jm.Activation(0.05), given[:-1], given[1:], dt)
         )
         errors.append(np.abs((a[2:] - a[:-2]) / (2 * dt) - slope[1:-1]).max())
     # Central differences: dt² a''' / 6, a''' at most 1/T³ of a unit input (its jump of slope, 20
@@ -56,7 +71,7 @@ def test_gain_and_phase_of_a_sine(x64, frequency):
     time, dt = 0.06, 2e-4
     t = dt * np.arange(round(2 / dt) + 1)
     given = jnp.asarray(np.sin(2 * np.pi * frequency * t))[:, None]
-    a = np.asarray(jm.Activation(time).through(given[:-1], given[1:], dt)[0])[:, 0]
+    a = np.asarray(through(jm.Activation(time), given[:-1], given[1:], dt)[0])[:, 0]
     late, turn = t >= 1.5, np.exp(2j * np.pi * frequency * t)  # e^-25 of the start is left
     columns = np.stack([turn.imag, turn.real], axis=1)
     in_phase, ahead = np.linalg.lstsq(columns[late], a[late], rcond=None)[0]
@@ -76,12 +91,10 @@ def test_white_noise_comes_out_with_its_variance(x64):
         steps = round(1.0 / dt)  # 20 T: all of the response
 
         def last(normals, dt=dt):
-            kicks = noise.realise(normals, dt).increments[:, :1] / dt
-            return jm.Activation(time).through(kicks, kicks, dt)[0][-1, 0]
+            kicks = unit_path(noise, normals, dt).increments / dt
+            return through(jm.Activation(time), kicks, kicks, dt)[0][-1, 0]
 
-        weights = np.asarray(
-            at_once(lambda key, steps=steps, last=last: jax.grad(last)(noise.draw(key, steps)), KEY)
-        )
+        weights = np.asarray(at_once(jax.grad(last), np.zeros((steps + 1, 1))))
         variance = np.sum(weights**2) * 4 * time * 80.0
         assert variance == pytest.approx(1 - (dt / time) ** 2 / 12, abs=0.1 * (dt / time) ** 3)
 

@@ -8,60 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import references
-import scipy.integrate
-import scipy.linalg
-from compiled import at_once
 from jax.scipy.special import gammainc
 
 import jaxmuscle as jm
 from jaxmuscle._common.types import Scalar
-from jaxmuscle.model import _own_parts
-from jaxmuscle.model._noise import Realisation
 
 KEY = jax.random.key(7)
 CHANNELS = ("K_w", "K_z", "C_w", "C_z")
 WHITE = jm.WhiteNoise(1.0, rate=50.0)
 BAND = jm.BandLimitedNoise(1.0, rate=50.0, cutoff=12.0)
 OU = jm.OrnsteinUhlenbeckNoise(1.0, 0.05)
-
-
-def unit_paths(noise, dt, steps, seeds=256, key=KEY):
-    def paths(key):
-        made = jax.vmap(lambda k: noise.realise(noise.draw(k, steps), dt))(
-            jax.random.split(key, seeds)
-        )
-        return made.values, made.slopes, made.increments
-
-    return Realisation(*at_once(paths, key))
-
-
-def band_variance(noise):
-    """∫ density df = cutoff π / (√2 rate), since ∫ dx / (1 + x⁴) = π/√2."""
-    return np.pi * noise.cutoff / (np.sqrt(2) * noise.rate)
-
-
-def band_autocovariance(noise, lag):
-    """Of N'' + √2 ω N' + ω² N = ω² w: damped at ω/√2 and oscillating at ω/√2."""
-    a = 2 * np.pi * noise.cutoff * np.abs(lag) / np.sqrt(2)
-    return band_variance(noise) * np.exp(-a) * (np.cos(a) + np.sin(a))
-
-
-@pytest.mark.parametrize("noise, variance", [(BAND, band_variance(BAND)), (OU, 1.0)])
-def test_the_density_integrates_to_the_stationary_variance(x64, noise, variance):
-    half, _ = scipy.integrate.quad(
-        lambda f: float(noise.psd(f)[0]), 0, np.inf, epsabs=1e-12, epsrel=1e-10
-    )
-    np.testing.assert_allclose(2 * half, variance, rtol=1e-8)
-
-
-@pytest.mark.parametrize("noise", [BAND, OU])
-def test_the_density_is_the_transform_of_the_autocovariance(x64, noise):
-    lag = np.linspace(0, 2.0, 200_001)
-    r = band_autocovariance(noise, lag) if noise is BAND else np.exp(-lag / noise.correlation_time)
-    for f in (0.0, 3.0, 12.0, 30.0):
-        transform = 2 * scipy.integrate.simpson(r * np.cos(2 * np.pi * f * lag), x=lag)
-        np.testing.assert_allclose(noise.psd(f), transform, rtol=1e-6)
 
 
 def test_psd_scales_with_the_square_of_the_amplitude():
@@ -71,150 +27,6 @@ def test_psd_scales_with_the_square_of_the_amplitude():
     np.testing.assert_allclose(
         rows, np.square([[0.1] * 2, [0.2] * 2, [0.0] * 2, [1.0] * 2]) / 100, rtol=1e-6
     )
-
-
-@pytest.mark.parametrize(
-    "noise", [WHITE, BAND, OU], ids=["white", "band-limited", "ornstein-uhlenbeck"]
-)
-def test_paths_have_the_density(x64, noise):
-    dt, steps, chunk = 4e-3, 2048, 256
-    paths = unit_paths(noise, dt, steps)
-    # White noise is the derivative of its increments' sum: its mean over a step.
-    x = (
-        np.asarray(paths.increments) / dt
-        if paths.values is None
-        else np.asarray(paths.values)[:, :steps]
-    )
-    bins = np.arange(4, 84, 2)  # to 80 Hz of 250 Hz
-    segments = x.reshape(256, steps // chunk, chunk, 4)
-    taper = np.hanning(chunk + 1)[:-1, None]
-    power = np.abs(np.fft.rfft(segments * taper, axis=2)) ** 2 * dt / np.sum(taper**2)
-    power = power[:, :, bins].mean(axis=(1, 3))
-    # The density of the *sampled* path is what a periodogram estimates: aliases are part of the
-    # reference, and so is the taper's leakage (no mean was removed).
-    frequency = (np.arange(4096) / 4096 - 0.5) / dt
-    sampled = (
-        (lambda f: np.full_like(f, 1 / 50.0))
-        if noise is WHITE
-        else lambda f: np.asarray(noise.density(f))
-    )
-    density = (
-        sampled(frequency)
-        if noise is WHITE
-        else references.aliased(sampled, 1 / dt, frequency, 200)
-    )
-    m = np.arange(chunk)
-    wave = np.exp(2j * np.pi * np.outer(frequency * dt, m)) * taper[:, 0]
-    kernel = (
-        np.abs(wave @ np.exp(-2j * np.pi * np.outer(m, bins) / chunk)) ** 2 * dt / np.sum(taper**2)
-    )
-    expected = density @ kernel / dt / len(frequency)
-    error = power.std(axis=0, ddof=1) / np.sqrt(len(power))
-    # bins two apart: independent
-    references.assert_standard_normal((power.mean(axis=0) - expected) / error)
-
-
-def covariances(x, lags):
-    """Mean over time and channels of x(t) x(t + lag) per seed (no mean is removed: it is zero)."""
-    n = x.shape[1]
-    return np.stack([(x[:, : n - k] * x[:, k:]).mean(axis=(1, 2)) for k in lags], axis=1)
-
-
-@pytest.mark.parametrize("dt", [8e-3, 2e-3])
-@pytest.mark.parametrize("noise", [BAND, OU], ids=["band-limited", "ornstein-uhlenbeck"])
-def test_the_autocovariance_is_exact_at_any_step(x64, noise, dt):
-    x = np.asarray(unit_paths(noise, dt, 500, seeds=512).values)
-    lags = np.rint(np.array([0.0, 0.008, 0.016, 0.032, 0.064]) / dt).astype(int)
-    seen = covariances(x, lags)
-    lag = lags * dt
-    exact = (
-        band_autocovariance(noise, lag) if noise is BAND else np.exp(-lag / noise.correlation_time)
-    )
-    deviation = seen - exact
-    standard = deviation.mean(axis=0) / (deviation.std(axis=0, ddof=1) / np.sqrt(len(x)))
-    # Lags of one path depend on each other: decorrelate them by their own covariance.
-    root = np.linalg.cholesky(np.cov(deviation.T) / len(x))
-    references.assert_standard_normal(np.linalg.solve(root, deviation.mean(axis=0)))
-    assert np.abs(standard).max() < 4
-
-
-@pytest.mark.parametrize("noise", [BAND, OU], ids=["band-limited", "ornstein-uhlenbeck"])
-def test_the_transition_is_the_exact_one(x64, noise):
-    """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form
-    covariance."""
-    steps, grids = 5, (8e-3, 2e-3)
-
-    def matrices(key):
-        normals = noise.draw(key, steps)[:, ::4]  # of the first channel
-        return [
-            jax.jacfwd(lambda z, h=dt: noise.realise(z, h).values[:, 0])(normals) for dt in grids
-        ]
-
-    for dt, found in zip(grids, at_once(matrices, KEY), strict=True):
-        matrix = np.asarray(found).reshape(steps + 1, -1)
-        lag = dt * np.subtract.outer(np.arange(steps + 1), np.arange(steps + 1))
-        exact = (
-            band_autocovariance(noise, lag)
-            if noise is BAND
-            else np.exp(-np.abs(lag) / noise.correlation_time)
-        )
-        np.testing.assert_allclose(matrix @ matrix.T, exact, rtol=1e-9, atol=1e-12)
-
-
-def test_band_limited_transition_is_the_matrix_exponential(x64):
-    dt, w = 3e-3, 2 * np.pi * BAND.cutoff
-    drift = np.array([[0.0, 1.0], [-(w**2), -np.sqrt(2) * w]])
-    zero = jnp.zeros((2, 2)).at[0].set(jnp.array([0.7, -0.4]))
-    path = BAND.realise(zero, dt)
-    assert path.values is not None and path.slopes is not None
-    start, end = (np.array([path.values[i, 0], path.slopes[i, 0]]) for i in (0, 1))
-    np.testing.assert_allclose(end, scipy.linalg.expm(drift * dt) @ start, rtol=1e-10)
-
-
-def test_slopes_are_the_derivative_of_values(x64):
-    omega = 2 * np.pi * BAND.cutoff
-    for dt in (2e-3, 5e-4):
-        path = unit_paths(BAND, dt, 500, seeds=64)
-        difference = np.diff(path.values, axis=1) / dt
-        slopes = np.asarray(path.slopes)
-        middle = 0.5 * (slopes[:, 1:] + slopes[:, :-1])
-        rms = np.sqrt(np.mean((difference - middle) ** 2) / (omega**2 * band_variance(BAND)))
-        # N' is as rough as Brownian motion of variance q = 2√2 ω var(N') per second: a bridge's
-        # mean has q dt / 12. The next term is of relative order ω dt.
-        np.testing.assert_allclose(
-            rms, np.sqrt(np.sqrt(2) * omega * dt / 6), rtol=0.5 * omega * dt + 0.01
-        )
-
-
-def test_white_increments_have_the_variance_of_their_step(x64):
-    for dt in (1e-3, 2.5e-4):
-        increments = np.asarray(unit_paths(WHITE, dt, 1000, seeds=64).increments)
-        variance = np.mean(increments**2) * WHITE.rate / dt
-        assert abs(variance - 1) < 3.3 * np.sqrt(2 / increments.size)
-        neighbours = np.mean(increments[:, 1:] * increments[:, :-1]) * WHITE.rate / dt
-        assert abs(neighbours) < 3.3 / np.sqrt(increments.size)
-
-
-def test_paths_are_stationary_from_the_start(x64):
-    for noise, variance in ((BAND, band_variance(BAND)), (OU, 1.0)):
-        first = np.asarray(unit_paths(noise, 2e-3, 1, seeds=4096).values)[:, 0] / np.sqrt(variance)
-        assert abs(np.mean(first**2) - 1) < 3.3 * np.sqrt(2 / first.size)
-
-
-@pytest.mark.parametrize("kind", [jm.WhiteNoise, jm.BandLimitedNoise, jm.OrnsteinUhlenbeckNoise])
-def test_channels_are_independent_unless_shared(x64, kind):
-    def path(noise):
-        unit = unit_paths(noise, 2e-3, 400, seeds=64)
-        return np.asarray(unit.increments if unit.values is None else unit.values)
-
-    own = path(kind(1.0))
-    assert own.shape[-1] == 4
-    products = np.stack(
-        [(own[..., i] * own[..., j]).mean(axis=1) for i in range(4) for j in range(i)]
-    )
-    standard = products.mean(axis=1) / (products.std(axis=1, ddof=1) / 8)
-    references.assert_standard_normal(standard)
-    assert path(kind(1.0, shared=True)).shape[-1] == 1
 
 
 def test_a_shared_noise_moves_all_coefficients_together(x64):
@@ -293,32 +105,6 @@ def test_impossible_rates_and_grids_are_refused():
         jm.simulate(
             jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise(correlation_time=0.01)), KEY, dt=0.01
         )
-
-
-def test_single_precision_paths_follow_double_ones():
-    for kind, attributes in (
-        (jm.BandLimitedNoise, ("values", "slopes")),
-        (jm.OrnsteinUhlenbeckNoise, ("values",)),
-        (jm.WhiteNoise, ("increments",)),
-    ):
-        normals = np.random.default_rng(0).normal(
-            size=(501, 8 if kind is jm.BandLimitedNoise else 4)
-        )
-
-        def paths(dtype, kind=kind, normals=normals, attributes=attributes):
-            def made(normals):
-                realisation = kind(1.0).realise(normals, 1e-3)
-                return [getattr(realisation, attribute) for attribute in attributes]
-
-            with jax.enable_x64(dtype == np.float64):
-                found = at_once(made, normals.astype(dtype))
-            assert all(path.dtype == dtype for path in found)
-            return [np.asarray(path, float) for path in found]
-
-        for single, double in zip(paths(np.float32), paths(np.float64), strict=True):
-            # The process noise is a difference of nearly equal numbers, good to a few 1e-4 in
-            # single precision.
-            np.testing.assert_allclose(single, double, atol=1e-3 * double.std())
 
 
 class Smooth(jm.model.AbstractNoise):
@@ -426,23 +212,6 @@ def test_a_noise_of_ones_own_is_looked_at(case):
     with pytest.raises(ValueError, match=f"Wrong.*{message}"):
         jm.Isometric(noise=type("Wrong", (Smooth,), {method: wrong})())
     assert jm.Isometric(noise=Smooth({"K_w": 0.1}))["noise_corner"] == 1.0
-
-
-@pytest.mark.parametrize(
-    "noise",
-    [WHITE, BAND, OU, jm.PinkNoise(1.0), jm.ResonantNoise(1.0, 9.0, 2.0)],
-    ids=lambda n: type(n).__name__,
-)
-def test_what_is_asked_of_a_noise_of_ones_own_holds_of_ours(noise, monkeypatch):
-    monkeypatch.setattr(_own_parts, "_ours", lambda part: False)
-    monkeypatch.setattr(_own_parts, "_SEEN", set())
-    # its recursion compiled as a whole; those of own classes, above, run as they are
-    kind = type(noise)
-    monkeypatch.setattr(
-        kind, "recursion", lambda self, dt, made=kind.recursion: eqx.filter_jit(made)(self, dt)
-    )
-    _own_parts.check_noise(noise)
-    assert type(noise) in _own_parts._SEEN
 
 
 def test_a_noise_of_ones_own_is_simulated_as_its_response_says():

@@ -6,11 +6,11 @@ import itertools
 import jax
 import numpy as np
 import pytest
-import references
 import scipy.integrate
 import scipy.linalg
 import scipy.signal
 from compiled import at_once
+from noise_paths import draw_normals
 
 import jaxmuscle as jm
 from jaxmuscle.model import NoiseSum
@@ -24,16 +24,6 @@ def density(f, frequency, width):
     return width / np.pi * f**2 / ((frequency**2 - f**2) ** 2 + width**2 * f**2)
 
 
-def autocovariance(lag, frequency, width):
-    """Of the velocity of a damped oscillator, roots -πb ± iω."""
-    rate, omega, lag = (
-        np.pi * width,
-        2 * np.pi * np.sqrt(complex(frequency**2 - width**2 / 4)),
-        np.abs(lag),
-    )
-    return (np.exp(-rate * lag) * (np.cos(omega * lag) - rate / omega * np.sin(omega * lag))).real
-
-
 def equation(frequency, width):
     """`q' = ω N`, `N' = -ω q - 2πb N + √(4πb) w`."""
     omega = 2 * np.pi * frequency
@@ -43,7 +33,7 @@ def equation(frequency, width):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_density_and_filter_are_those_of_the_equation(x64, case):
+def test_the_density_is_that_of_the_equation(x64, case):
     frequency, width = CASES[case]
     noise, f = jm.ResonantNoise(0.3, frequency, width), np.r_[0.0, np.geomspace(0.01, 1e3, 50)]
     np.testing.assert_allclose(noise.psd(f), 0.09 * density(f, frequency, width), rtol=1e-12)
@@ -60,21 +50,6 @@ def test_density_and_filter_are_those_of_the_equation(x64, case):
         for pair in itertools.pairwise(edges)
     ]
     assert 2 * sum(part for part, _ in parts) == pytest.approx(1.0, rel=1e-9)
-    made = jax.tree.map(np.asarray, noise.shaping_filter())
-    reply = [
-        made.H @ np.linalg.solve(2j * np.pi * x * np.eye(2) - made.F, made.G) + made.L for x in f
-    ]
-    np.testing.assert_allclose(
-        np.abs(np.array(reply)[:, 0]) ** 2, density(f, frequency, width), rtol=1e-9, atol=1e-30
-    )
-    slowest = -np.linalg.eigvals(equation(frequency, width)[0]).real.max()
-    lag = np.linspace(0, 30 / slowest, 2_000_001)
-    for x in (0.0, 0.5 * frequency, 2.5 * frequency):
-        transform = 2 * scipy.integrate.simpson(
-            autocovariance(lag, frequency, width) * np.cos(2 * np.pi * x * lag), x=lag
-        )
-        # 30 e-folds; Simpson's (ω h)⁴
-        np.testing.assert_allclose(noise.density(x), transform, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
@@ -113,68 +88,6 @@ def test_a_step_is_the_exact_one(case, precision):
         )
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_the_path_is_exact_on_the_grid(x64, case):
-    """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form
-    covariance."""
-    noise, steps = jm.ResonantNoise(1.0, *CASES[case]), 6
-    grids = (8e-3, 1e-3)
-
-    def matrices(key):
-        normals = noise.draw(key, steps)
-        return [
-            jax.jacfwd(lambda z, h=dt: noise.realise(z, h).values[:, 0])(normals) for dt in grids
-        ]
-
-    for dt, found in zip(grids, at_once(matrices, KEY), strict=True):
-        matrix = np.asarray(found).reshape(steps + 1, -1)
-        lag = dt * np.subtract.outer(np.arange(steps + 1), np.arange(steps + 1))
-        np.testing.assert_allclose(
-            matrix @ matrix.T, autocovariance(lag, *CASES[case]), rtol=1e-9, atol=1e-11
-        )
-
-
-@pytest.mark.parametrize("precision", ["float64", "float32"])
-@pytest.mark.parametrize("case", CASES)
-def test_paths_have_variance_covariances_and_spectrum(case, precision):
-    """2048 seeds of 2 s; the expected periodogram is that of the autocovariance and the taper."""
-    dt, steps, seeds = 4e-3, 512, 2048
-    with jax.enable_x64(precision == "float64"):
-        noise = jm.ResonantNoise(1.0, *CASES[case])
-        path = jax.vmap(lambda key: noise.realise(noise.draw(key, steps - 1), dt).values)
-        values = at_once(lambda key: path(jax.random.split(key, seeds)), KEY)
-    assert values.dtype == precision and values.shape == (seeds, steps, 1)
-    x = np.asarray(values, float)[..., 0]
-    lags, bins, taper = (
-        np.array([0, 1, 5, 14, 28, 100]),
-        np.arange(2, 125, 3),
-        scipy.signal.get_window("hann", steps),
-    )
-    seen = [
-        x[:, 0] ** 2,
-        x[:, -1] ** 2,
-        *((x[:, : steps - k] * x[:, k:]).mean(axis=1) for k in lags),
-    ]
-    r = autocovariance(dt * np.arange(steps), *CASES[case])
-    overlap = (
-        np.correlate(taper, taper, "full")[steps - 1 :] * r * np.where(np.arange(steps) > 0, 2, 1)
-    )
-    expected = np.cos(2 * np.pi * np.outer(bins, np.arange(steps)) / steps) @ overlap
-    power = np.abs(np.fft.rfft(x * taper, axis=1)[:, bins]) ** 2
-
-    def standard(found, exact):
-        return (found.mean(axis=0) - exact) / (found.std(axis=0, ddof=1) / np.sqrt(seeds))
-
-    # Lags of a path depend on each other: the bound alone. Bins three apart do not, unless one line
-    # leaks into all.
-    references.assert_standard_normal(
-        standard(np.stack(seen, axis=1), np.r_[1.0, 1.0, r[lags]]), every=len(seen)
-    )
-    references.assert_standard_normal(
-        standard(power, expected), every=len(bins) if case == "narrow" else 1
-    )
-
-
 def test_a_sum_is_its_parts(x64):
     band, tremor = jm.BandLimitedNoise({"K_w": 0.2}), jm.ResonantNoise(0.03)
     both, f = band + tremor, np.array([1.0, 9.0])
@@ -190,9 +103,10 @@ def test_a_sum_is_its_parts(x64):
     )
 
     def drawn(key):
-        alone, together = (noise.per_channel().draw(key, 20) for noise in (band, both))
-        again = (tremor + tremor).draw(key, 2000)
-        return both.psd(f), alone, together, again, independent.draw(key, 3), shared.draw(key, 3)
+        alone, together = (draw_normals(noise.per_channel(), key, 20) for noise in (band, both))
+        again = draw_normals(tremor + tremor, key, 2000)
+        few = (draw_normals(noise, key, 3)[0] for noise in (independent, shared))
+        return both.psd(f), alone[0], together, again, *few
 
     found, alone, together, again, *four = at_once(drawn, KEY)
     np.testing.assert_allclose(found, rows, rtol=1e-12)

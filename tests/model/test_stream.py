@@ -13,11 +13,7 @@ import scipy.special
 import scipy.stats
 from compiled import at_once
 
-import jaxmuscle as jm
-from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._stream import APART, START, Draws, Stream, _normal, _weak
-from jaxmuscle.simulation._batch import respond
-from jaxmuscle.simulation._grid import Grid
 
 KEY = jax.random.key(21)
 SEEDS, STEPS, CHANNELS = 256, 2048, 4
@@ -292,62 +288,3 @@ def test_threefry_makes_other_numbers_of_the_same_law(normals):
     references.assert_standard_normal(
         together([(other.reshape(64, -1), normals[:64, :512].reshape(64, -1))])
     )
-
-
-BAND = jm.BandLimitedNoise()
-NOISES = {
-    "white": (jm.WhiteNoise(), False),
-    "band-limited": (BAND, False),
-    "sum, active": (BAND + jm.ResonantNoise(), True),
-    "white, active": (jm.WhiteNoise(), True),
-    "Ornstein-Uhlenbeck": (jm.OrnsteinUhlenbeckNoise(), False),
-    "pink": (jm.PinkNoise(), False),
-    "shared": (jm.BandLimitedNoise(0.1, shared=True), False),
-    "drive": (jm.OrnsteinUhlenbeckNoise({"K_w": 0.1, "P_w": 0.05}), True),
-}
-
-
-def largest(ours, given):
-    """Difference of each state, relative to its largest value."""
-    ours, given = np.asarray(ours, float), np.asarray(given, float)
-    return np.max(np.abs(ours - given).max(axis=0) / np.abs(given).max(axis=0))
-
-
-def assert_drawn_on_the_way(noise, active):
-    task = as_arrays(
-        jm.PrescribedForce(noise=noise, activation=jm.Activation() if active else None)
-    )
-    grid = Grid(1e-3, 600, 5)
-
-    def both(task, key):
-        path = task.noise.realise(task.noise.draw(key, grid.steps), grid.dt)
-        return [respond(task, source, grid, "instant") for source in (Stream.of(key), path)]
-
-    drawn, given = at_once(both, task, KEY)
-    tolerance = 200 * float(jnp.finfo(drawn[1].dtype).eps)
-    assert largest(drawn[0], given[0]) < tolerance and largest(drawn[1], given[1]) < tolerance
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NOISES)
-def test_what_is_drawn_on_the_way_is_the_path_that_draw_and_realise_give(x64, name):
-    assert_drawn_on_the_way(*NOISES[name])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["white, active", "sum, active", "pink"])
-def test_what_is_drawn_on_the_way_is_the_path_in_single_precision_too(name):
-    assert_drawn_on_the_way(*NOISES[name])
-
-
-def test_simulate_draws_from_the_key_folded_with_the_seed(x64):
-    found = jm.simulate(jm.PrescribedForce(noise=BAND), KEY, seed=4, substeps=1)
-
-    def given(key):
-        path = BAND.realise(BAND.draw(jax.random.fold_in(key, 4), 600), 1e-3)
-        return respond(found.task, path, Grid(1e-3, 600, 10), "instant")[0]
-
-    states = at_once(given, KEY)
-    # The filter's noise is a difference of nearly equal numbers: another program has it to 1e-10 or
-    # so.
-    assert largest(np.asarray(found.states)[:61], states) < 1e-9

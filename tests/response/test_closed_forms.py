@@ -9,11 +9,10 @@ import pytest
 import references
 import scipy.integrate
 from compiled import at_once
+from noise_paths import coarsen, draw_normals, respond
 
 import jaxmuscle as jm
 from jaxmuscle.model import QuadraticDamping, QuadraticStiffness
-from jaxmuscle.model._noise import Realisation
-from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 
 KEY = jax.random.key(23)
@@ -64,17 +63,6 @@ def response(f, noise):
             )
 
 
-def halved(path):
-    """The same path on the grid of twice the step."""
-    pick = lambda x: None if x is None else x[..., ::2, :]  # noqa: E731
-    increments = path.increments
-    return Realisation(
-        pick(path.values),
-        pick(path.slopes),
-        None if increments is None else increments[..., ::2, :] + increments[..., 1::2, :],
-    )
-
-
 SMALL = 2e-3  # second order effects of this noise are 1e-5 of its power
 
 
@@ -101,9 +89,10 @@ def test_spectrum_of_a_linear_oscillator(x64, noise):
     seeds = 128 if isinstance(noise, jm.WhiteNoise) else 32
 
     def spectra(key):
-        fine = task.noise.realise(task.noise.draw(key, 30_000), 5e-4)
-        pairs = (fine, Grid(5e-4, 30_000, 20)), (halved(fine), Grid(1e-3, 15_000, 10))
-        outputs = [respond(task, path, grid, "instant")[1] for path, grid in pairs]
+        fine = draw_normals(noise, key, 30_000)
+        halved = coarsen(noise, fine, 5e-4, 2)
+        pairs = (fine, Grid(5e-4, 30_000, 20)), (halved, Grid(1e-3, 15_000, 10))
+        outputs = [respond(task, normals, grid)[1] for normals, grid in pairs]
         return [
             jm.spectra.spectrum_of(output, task.settings, (5.0, 15.0)).power for output in outputs
         ]

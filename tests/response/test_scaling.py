@@ -10,7 +10,7 @@ from compiled import at_once
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.response._expected_moments import expected_moments, linear_spectrum
+from jaxmuscle.response._expected_moments import expected_moments
 from jaxmuscle.response._scaling import relative_variation
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -302,41 +302,6 @@ def test_the_only_maximum_of_the_expected_force_is_bin_1(x64, hamilton):
     found = jm.spectra.peaks(jm.expected_spectrum(hamilton), min_prominence=0.0)
     assert found.maximum.bin == 1 and found.maximum.frequency == 0.390625
     assert not found.local_maxima
-
-
-@pytest.fixture(scope="module")
-def played(hamilton):
-    """100 seeds, by the program of `jaxmuscle reproduce`."""
-    with jax.enable_x64(True):
-        return jm.ensemble(hamilton, jax.random.key(12), seeds=100, chunk=8, control=False)
-
-
-def test_the_only_maximum_of_100_simulated_seeds_is_bin_1(x64, hamilton, played, capsys):
-    found = jm.spectra.peaks(played.spectrum().mean())
-    assert found.maximum.bin == 1 and not found.local_maxima
-    each = np.asarray(played.spectrum().proportional).argmax(axis=1) == 0
-    with capsys.disabled():
-        print(
-            f"\nzagrodny-hamilton: {100 * each.mean():.0f} % of 100 single seeds have their maximum"
-            " in bin 1"
-        )
-    assert each.mean() > 0.9
-    # A simulated mean contains what the linear response leaves out: the rest of the input's rise.
-    expected = np.asarray(jm.expected_spectrum(hamilton).proportional)
-    seen = np.asarray(played.spectrum().mean().proportional)
-    assert seen[0] == pytest.approx(expected[0], abs=0.05)
-
-
-def test_the_preset_is_smoother_and_its_amplitude_falls(x64, hamilton, played):
-    beside = jm.load_preset("zagrodny-slifkin")
-    smooth, rough = (
-        np.asarray(linear_spectrum(t, t.settings).proportional) for t in (hamilton, beside)
-    )
-    assert smooth[5:].sum() < 0.2 * rough[5:].sum()  # power above 2.2 Hz
-    force = np.asarray(played.output)
-    # Three cycles of 0.391 Hz at either end of the analysed window.
-    early, late = (force[:, a:b].std(axis=1).mean() for a, b in ((500, 1267), (733, 1500)))
-    assert late < early
 
 
 # --- another mean force

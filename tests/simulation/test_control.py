@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import references
 from compiled import at_once
+from noise_paths import coarsen, draw_normals, respond
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.model._noise import Realisation
 from jaxmuscle.response._expected_moments import linear_spectrum
 from jaxmuscle.response._linear_task import LinearTask
 from jaxmuscle.response._linearised import linearised
-from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.simulation._simulate import companion
 
@@ -161,17 +160,15 @@ def test_the_controlled_estimate_has_no_linear_time_step_error(x64, kind):
     task = as_arrays(made(kind, "band-limited", "human"))
     linear, steps, seeds = linearised(task), 6000, 64
 
-    def spectra(path):
-        steps = len(path.values) - 1
-        outputs = (
-            respond(part, path, Grid(15.0 / steps, steps, steps // 1500), "instant")[1]
-            for part in (task, linear)
-        )
+    def spectra(normals):
+        steps = len(normals[0]) - 1
+        grid = Grid(15.0 / steps, steps, steps // 1500)
+        outputs = (respond(part, normals, grid)[1] for part in (task, linear))
         return [jm.spectra.spectrum_of(output, task.settings, WINDOW).power for output in outputs]
 
     def both(key):
-        fine = task.noise.realise(task.noise.draw(key, steps), 15.0 / steps)
-        return spectra(Realisation(fine.values[::2], fine.slopes[::2])), spectra(fine)
+        fine = draw_normals(task.noise, key, steps)
+        return spectra(coarsen(task.noise, fine, 15.0 / steps, 2)), spectra(fine)
 
     coarse, fine = at_once(jax.vmap(both), jax.random.split(KEY, seeds))
     mean = np.asarray(jm.expected_spectrum(task).power)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import references
 from compiled import at_once
+from noise_paths import coarsen, draw_normals, respond
 
 import jaxmuscle as jm
 from jaxmuscle.model import NoiseSum
-from jaxmuscle.model._noise import Realisation
 from jaxmuscle.response._expected_moments import linear_spectrum
-from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 
 KEY = jax.random.key(43)
@@ -70,14 +69,6 @@ def test_the_control_variate_has_the_expected_spectrum(x64):
     np.testing.assert_allclose(mean.power, expected, rtol=0.01)
 
 
-def halved(path):
-    """The same path on the grid of twice the step."""
-    pick = lambda x: None if x is None else x[::2]  # noqa: E731
-    kicks = None if path.increments is None else path.increments[::2] + path.increments[1::2]
-    parts = None if path.parts is None else tuple(map(halved, path.parts))
-    return Realisation(pick(path.values), pick(path.slopes), kicks, parts)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in RUNGS if name != "activation"])
 def test_half_the_step_gives_the_same_spectrum(x64, name):
@@ -85,9 +76,10 @@ def test_half_the_step_gives_the_same_spectrum(x64, name):
     task, steps = RUNGS[name].settled(), 12_240
 
     def spectra(key):
-        fine = task.noise.realise(task.noise.draw(key, steps), 5e-4)
-        pairs = (fine, Grid(5e-4, steps, 20)), (halved(fine), Grid(1e-3, steps // 2, 10))
-        outputs = [respond(task, path, grid, "instant")[1] for path, grid in pairs]
+        fine = draw_normals(task.noise, key, steps)
+        halved = coarsen(task.noise, fine, 5e-4, 2)
+        pairs = (fine, Grid(5e-4, steps, 20)), (halved, Grid(1e-3, steps // 2, 10))
+        outputs = [respond(task, normals, grid)[1] for normals, grid in pairs]
         return [
             jm.spectra.spectrum_of(output, task.settings, (1.0, 6.12)).power for output in outputs
         ]

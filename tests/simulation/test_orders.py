@@ -8,24 +8,14 @@ import numpy as np
 import pytest
 import references
 from compiled import at_once, kept_jit
+from noise_paths import coarsen, draw_normals, respond
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.model._noise import Realisation
-from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 
 KEY = jax.random.key(5)
 FINE, SECONDS, SEEDS = 2**14, 0.25, 400
-
-
-def coarsened(path, factor):
-    """The same path on a grid of `factor` times the step."""
-    pick = lambda x: None if x is None else x[::factor]  # noqa: E731
-    increments = path.increments
-    if increments is not None:
-        increments = increments.reshape(-1, factor, increments.shape[-1]).sum(axis=1)
-    return Realisation(pick(path.values), pick(path.slopes), increments)
 
 
 def strong_errors(task, factors):
@@ -34,25 +24,19 @@ def strong_errors(task, factors):
     # displacement as velocity, eigenfrequency 30/s
     keys, scale = jax.random.split(KEY, SEEDS), np.array([30.0, 1.0])
 
-    def drawn(key):
-        path = task.noise.realise(task.noise.draw(key, steps), 1 / FINE)
-        return path.values, path.slopes, path.increments
-
-    fine = at_once(jax.vmap(drawn), keys)
-
-    def final(fine, factor):
+    def final(factor):
         grid = Grid(factor / FINE, steps // factor, steps // factor)
 
-        def ended(path):
-            return (
-                respond(task, coarsened(Realisation(*path), factor), grid, "instant")[0][-1] * scale
-            )
+        def ended(key):
+            fine = draw_normals(task.noise, key, steps)
+            states, _ = respond(task, coarsen(task.noise, fine, 1 / FINE, factor), grid)
+            return states[-1] * scale
 
-        return at_once(jax.vmap(ended), fine)
+        return at_once(jax.vmap(ended), keys)
 
-    reference = final(fine, 1)
+    reference = final(1)
     return [
-        float(jnp.sqrt(jnp.mean(jnp.sum((final(fine, factor) - reference) ** 2, axis=-1))))
+        float(jnp.sqrt(jnp.mean(jnp.sum((final(factor) - reference) ** 2, axis=-1))))
         for factor in factors
     ]
 
@@ -62,23 +46,16 @@ ROUND, ROUND_SECONDS = 8000, 2.0  # steps per second of the finest path of the r
 
 @functools.cache
 def recorded(factor):
-    """What a task gives on a grid of `factor` times the finest step: one program for tasks of one
-    structure."""
-    grid = Grid(factor / ROUND, int(ROUND_SECONDS * ROUND) // factor, 1)
-    path = lambda given: coarsened(Realisation(*given), factor)  # noqa: E731
-    return kept_jit(lambda task, given: respond(task, path(given), grid, "instant")[1])
+    """What a task gives on a grid of `factor` times the finest step, on the normals of one path of
+    unit noise: one program for tasks of one structure."""
+    steps, noise = int(ROUND_SECONDS * ROUND), jm.BandLimitedNoise(cutoff=10.0)
+    grid = Grid(factor / ROUND, steps // factor, 1)
 
+    def output(task, key):
+        normals = coarsen(noise, draw_normals(noise, key, steps), 1 / ROUND, factor)
+        return respond(task, normals, grid)[1]
 
-@functools.cache
-def unit_path():
-    """The same for noise of any amplitude."""
-
-    def drawn(key):
-        noise = jm.BandLimitedNoise(cutoff=10.0)
-        path = noise.realise(noise.draw(key, int(ROUND_SECONDS * ROUND)), 1 / ROUND)
-        return path.values, path.slopes
-
-    return at_once(drawn, KEY)
+    return kept_jit(lambda task: output(task, KEY))
 
 
 def moving(noise):
@@ -142,12 +119,12 @@ def test_what_task_1_asks_for_moves_task_2_the_same_way(x64, amplitude, lowest, 
     )
     errors, dts = [], []
     for factor in (16, 4):
-        force = np.asarray(recorded(factor)(as_arrays(forward), unit_path()))
+        force = np.asarray(recorded(factor)(as_arrays(forward)))
         dt = factor / ROUND
         time = dt * np.arange(len(force))
         pulled = jm.model.Sampled.through(time, force)
         back = forward.as_task(jm.PrescribedForce, P_w=pulled, F_ext=forward.F_ext)
-        x_z = np.asarray(recorded(factor)(as_arrays(back), unit_path()))
+        x_z = np.asarray(recorded(factor)(as_arrays(back)))
         expected = np.asarray(at_once(jax.vmap(forward.x_z), time))
         errors.append(np.abs(x_z - expected).max() / 0.005)
         dts.append(dt)

@@ -12,15 +12,15 @@ import pytest
 import references
 import scipy.signal
 from compiled import at_once, drawing, kept_jit
+from noise_paths import respond
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays, is_concrete
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model import Decay, RampHold, Sampled, SmoothStep
-from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.simulation import _simulate
-from jaxmuscle.simulation._batch import respond, streams_of
+from jaxmuscle.simulation._batch import streams_of
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.simulation._simulate import schedule, stable_substeps
 
@@ -186,16 +186,18 @@ def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
     """diffrax rounds the times of steps: none may find its neighbour's noise."""
     with jax.enable_x64(precision == "float64"):
         noise = np.random.default_rng(0).normal(size=(steps + 1, 4)).astype(precision)
-        task = as_arrays(
-            Integral(noise=jm.WhiteNoise(1.0, relative=False), harmonic=jm.Harmonic(0.0))
+        # values of the numbers themselves, as it forgets at once; and increments of them
+        kinds = (
+            jm.OrnsteinUhlenbeckNoise(1.0, 1e-9, relative=False),
+            jm.WhiteNoise(1.0, rate=1e-3, relative=False),
         )
+        tasks = [as_arrays(Integral(noise=kind, harmonic=jm.Harmonic(0.0))) for kind in kinds]
         grid = Grid(1e-3, steps, every, substeps)
 
-        def integrals(task, noise):
-            paths = Realisation(values=noise), Realisation(increments=noise[1:])
-            return [respond(task, path, grid, "instant")[0][:, 0] for path in paths]
+        def integrals(tasks, noise):
+            return [respond(task, (noise,), grid)[0][:, 0] for task in tasks]
 
-        smooth, rough = at_once(integrals, task, noise)
+        smooth, rough = at_once(integrals, tasks, noise)
         sums = (
             np.cumsum(0.5e-3 * (noise[1:, 0] + noise[:-1, 0]).astype(float)),
             np.cumsum(noise[1:, 0].astype(float)),

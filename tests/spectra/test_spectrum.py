@@ -281,7 +281,7 @@ def test_pwelch_puts_the_mean_into_the_first_bin(x64):
     noise = 0.1 * np.random.default_rng(3).standard_normal(1000)
     matlab = Spectrum(
         SpectrumSettings().frequency,
-        welch(10 + noise, SpectrumSettings.pwelch()),
+        welch(10 + noise, SpectrumSettings.named("pwelch")),
         SpectrumSettings(),
     )
     assert matlab.proportional[0] > 0.999
@@ -399,7 +399,7 @@ def test_a_drift_leaves_slow_spectra_alone(x64):
     [
         SpectrumSettings(),
         SpectrumSettings.named("multitaper"),
-        SpectrumSettings.pwelch(),
+        SpectrumSettings.named("pwelch"),
         SpectrumSettings(
             rate=np.float32(120), length=np.int64(128), first_bin=0, filter_cutoff=None
         ),

@@ -256,24 +256,6 @@ def test_held_the_belly_and_the_tendon_balance(muscle, x_z):
     np.testing.assert_allclose(force, numpy_tendon(p, root.x[0] - x_z), rtol=1e-8)
 
 
-@pytest.mark.parametrize("share", [0.75, 0.95])
-@pytest.mark.slow
-def test_under_a_load_the_belly_finds_the_length_that_carries_it(muscle, share):
-    p = numpy_values(muscle)
-    held = float(muscle.held_force)
-    task = hill.at_activation(
-        jm.PrescribedForce(held, share * held, muscle=muscle), muscle.activation
-    )
-    balance = lambda x: numpy_belly(p, x, 0.0) - share * held  # noqa: E731
-    x_w = scipy.optimize.brentq(balance, 0.0, 0.6 * p["optimal_length"], xtol=1e-14)
-    stretch = scipy.optimize.brentq(
-        lambda e: numpy_tendon(p, e) - share * held, 0.0, 0.1, xtol=1e-15
-    )
-    np.testing.assert_allclose(
-        jm.response.equilibrium(task), [x_w, 0.0, x_w - stretch, 0.0], rtol=1e-7, atol=1e-11
-    )
-
-
 def test_a_muscle_that_cannot_be_is_refused():
     for name in (
         "force_max",
@@ -441,19 +423,6 @@ def test_own_muscles_run_at_scale(tmp_path):
     np.testing.assert_array_equal(found.to_xarray()["velocity_max"], [3.6, 4.2])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name, largest", [("isometric", 0.2), ("force", 0.05), ("motion", 1.0)])
-def test_every_task_runs_and_without_noise_every_seed_is_the_same(name, largest):
-    noisy = np.asarray(jm.ensemble(TASKS[name](muscle=HillMuscle()), KEY, **SHORT).output)
-    assert np.all(np.isfinite(noisy)) and np.ptp(noisy[0]) > 0 and np.any(noisy[0] != noisy[1])
-    task = quiet(TASKS[name](muscle=HillMuscle()), harmonic_amplitude=0.0)
-    silent = np.asarray(jm.ensemble(task, KEY, **SHORT).output)
-    np.testing.assert_array_equal(silent[0], silent[1])
-    # Default noise: a few hundredths of the force, less of a displacement; P_w of a motion contains
-    # its time derivative.
-    assert 0 < np.abs(noisy - silent).max() < largest * np.abs(silent).max()
-
-
 # --- spectra, gradients, fits
 
 
@@ -524,31 +493,6 @@ def test_the_mean_of_simulations_is_the_linear_response(x64):
     # 320 seeds: 3 % per bin, several times what second order adds (measured with the control
     # variate: below 1 %).
     references.assert_standard_normal(z, every=3)
-
-
-@pytest.mark.slow
-def test_the_spectrum_goes_by_its_rules(x64):
-    task = hill.held_task()
-    power = np.asarray(jm.expected_spectrum(task).power)
-    names = ("noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
-    louder = task.replace(**{name: 2 * task[name] for name in names})
-    np.testing.assert_allclose(jm.expected_spectrum(louder).power, 4 * power, rtol=1e-9)
-    # At rest nothing moves: noise on the damping has no first-order effect.
-    damping = task.replace(noise_C_w=0.03, noise_C_z=0.03)
-    np.testing.assert_allclose(jm.expected_spectrum(damping).power, power, rtol=1e-9)
-    # A stiff tendon and a light, fast belly: the force is -ΔK_w x_w. In the density of the samples,
-    # both sides of f = 0.
-    alone = task.replace(
-        noise_K_z=0.0, harmonic_amplitude=0.0, tendon_strain=0.004, velocity_max=100.0, m_w=0.01
-    )
-    x_w, K_w = float(jm.response.equilibrium(alone)[0]), float(alone.muscle.base()[0])
-    f = np.asarray(jm.expected_spectrum(alone).frequency)[1:12]
-    density = references.aliased(lambda f: 1 / (100 * (1 + (f / 50) ** 4)), 100.0, f)
-    # Left out: K_w / (K_w + K_z) below 0.1 %, the resonance near 670 Hz, the bend of the density
-    # across a bin.
-    np.testing.assert_allclose(
-        jm.expected_spectrum(alone).power[1:12], 2 * (0.15 * K_w * x_w) ** 2 * density, rtol=0.01
-    )
 
 
 @pytest.mark.slow

@@ -1,9 +1,6 @@
 """`jaxmuscle reproduce`."""
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from jaxmuscle import paper
 
@@ -15,15 +12,6 @@ FIGURES = ["fig2", "fig3", "fig4a", "fig4b", "fig5", "fig6a", "fig6b", "fig7", "
 
 def reproduce(
     output: Output = Path("out/reproduce"),
-    recording: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="FILE",
-            help=(
-                "Recording of a person for Figures 7 and 8; give it three times, for three people."
-            ),
-        ),
-    ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -32,27 +20,19 @@ def reproduce(
     The paper is that of Zagrodny, Wojnicz, Ludwicki and Barański, from which the model is. Writes
     DIR/index.html (open it in a browser), DIR/fig2 ... fig8 as .png and .pdf, and DIR/claims.json.
 
-    Examples:
+    Example:
 
         jaxmuscle reproduce --out out/reproduce
-
-        jaxmuscle reproduce --recording anna.csv --recording ben.csv --recording chris.csv
     """
     with reporting(as_json):
         writable(
-            output,
-            "claims.json",
-            beside=["index.html"],
-            figures=FIGURES,
-            reads=recording or (),
-            force=force,
+            output, "claims.json", beside=["index.html"], figures=FIGURES, reads=(), force=force
         )
-        given = paper.given_recordings(recording) if recording else None
-        _reproduce(output, given)
+        _reproduce(output)
 
 
-def _reproduce(folder: Path, given) -> None:
-    rows = paper.check(paper.reproduce(folder, given, progress=True))
+def _reproduce(folder: Path) -> None:
+    rows = paper.check(paper.reproduce(folder, progress=True))
     record({"summary": paper.counted(rows), "claims": [row._asdict() for row in rows]})
     out.print(paper.counted(rows))
     for row in rows:

@@ -1,8 +1,7 @@
 """Activation: what the active tissue makes of the nervous drive, a critically damped twitch."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -61,30 +60,14 @@ class Activation(Spelled, Inexact):
         rate = 1 / jnp.asarray(self.time)
         return rate * jnp.array([[0.0, 1.0], [-1.0, -2.0]]), jnp.stack([0 * rate, rate])
 
-    def through(
-        self, before: Float[Array, "steps inputs"], after: Float[Array, "steps inputs"], dt: Scalar
-    ) -> tuple[Float[Array, "points inputs"], Float[Array, "points inputs"]]:
-        """Values and slopes of what comes out, from rest; what goes in runs straight from `before`
-        to `after` in a step."""
-        step = self.transition(dt, before.dtype)
-
-        def advance(state, given):
-            new = step.advance(state, *given)
-            return new, new
-
-        rest = jnp.zeros(before.shape[1:], before.dtype)
-        _, (a, b) = jax.lax.scan(advance, (rest, rest), (before, after))
-        a, b = (jnp.concatenate([rest[None], values]) for values in (a, b))
-        return a, b / self.time
-
-    def transition(self, dt: Scalar, dtype: Any = None) -> "Transition":
+    def transition(self, dt: Scalar) -> "Transition":
         """What a step of dt [s] does to the states (a, b = T a'), exactly, where the input runs
         straight in it.
 
         Its `advance((a, b), n, m)` gives the states after a step in which the input runs from n to
-        m. They have the precision `dtype`, by default JAX's.
+        m.
         """
-        x = jnp.asarray(dt / self.time, jnp.result_type(float) if dtype is None else dtype)
+        x = jnp.asarray(dt / self.time, jnp.result_type(float))
         share = jnp.asarray(NODES, x.dtype)
         y = x * (1 - share)  # time left in the step
         weight = x * jnp.asarray(WEIGHTS, x.dtype) * jnp.exp(-y)

@@ -3,36 +3,21 @@
 import abc
 import functools
 import operator
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import Inexact, as_inexact, require
 from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.types import Scalar
 
 from ._parameters import CHANNELS, INPUTS, default
-from ._stream import APART, START, Draws, Stream
 
 Amplitude = Scalar | tuple | list | dict | None
-
-
-class Realisation(eqx.Module):
-    """One unit-amplitude noise path on a grid of `steps` steps.
-
-    `values` and `slopes` (N and dN/dt) hold at the `steps + 1` grid points, `increments` (of white
-    noise) between them; what a noise does not have is None. Of a sum, which has none of them, the
-    path of each of its `parts`.
-    """
-
-    values: Float[Array, "*seeds points channels"] | None = None
-    slopes: Float[Array, "*seeds points channels"] | None = None
-    increments: Float[Array, "*seeds steps channels"] | None = None
-    parts: "tuple[Realisation, ...] | None" = None
 
 
 class Recursion(eqx.Module):
@@ -123,49 +108,6 @@ class AbstractNoise(Spelled, Inexact):
     @abc.abstractmethod
     def check_step(self, dt: float) -> None:
         """Raise a `ValueError` if a grid of step dt [s] is too coarse for this noise."""
-
-    def draw(self, key: PRNGKeyArray, steps: int, draws: Draws = Draws()) -> Any:  # noqa: B008
-        """The standard normal numbers of one seed: a row that begins the noise and a row for each
-        step.
-
-        `key` is the seed's own, that of seed i of a simulation `jax.random.fold_in(key, i)`.
-
-        Shape (steps + 1, n), n = `channels` times the `numbers` of `recursion`. White noise has
-        only the rows of the steps; a sum of noises has a tuple of these. `draws` says how the
-        numbers are made.
-        """
-        return self._drawn(Stream.of(key, draws), steps, 0)
-
-    def _drawn(self, stream: Stream, steps: int, part: int) -> Any:
-        count = self.channels * self.recursion(1e-3).numbers
-        given = stream.ahead(jnp.arange(steps), (*[0] * part, part * APART), (*[1] * part, count))
-        later = jnp.stack(stream.numbers(given, part, part * APART, count), axis=1)
-        if self.smoothness == 0:
-            return later
-        return jnp.concatenate([jnp.stack(stream.normals(START, part * APART, count))[None], later])
-
-    def realise(self, normals: Any, dt: Scalar) -> Realisation:
-        """The unit path that the normals stand for, exact in distribution on the grid of step dt
-        [s].
-
-        It has `values` N and `slopes` dN/dt at all grid points, or `increments` between them for
-        white noise; None for what a noise does not have. That of a sum has `parts` instead.
-        """
-        made = jax.tree.map(lambda x: jnp.asarray(x, normals.dtype), self.recursion(dt))
-        rows = normals.reshape(len(normals), made.numbers, -1)  # of every channel
-        if made.direct is not None:
-            return Realisation(increments=made.direct * rows[:, 0])
-
-        def advance(q, z):
-            q = made.advance(q, tuple(z))
-            return q, q
-
-        begun = made.start(tuple(rows[0]))
-        _, later = jax.lax.scan(advance, begun, rows[1:])
-        whole = tuple(
-            jnp.concatenate([first[None], rest]) for first, rest in zip(begun, later, strict=True)
-        )
-        return Realisation(values=made.value(whole), slopes=made.slope(whole))
 
     def psd(self, f: Float[Array | np.ndarray, " frequencies"] | Scalar) -> Float[Array, "..."]:
         """Two-sided power density `amplitude² density(f)` [amplitude²/Hz], one row per amplitude if
@@ -322,15 +264,6 @@ class NoiseSum(AbstractNoise):
         for part in self.parts:
             rows = rows.at[jnp.array(part.acts_on)].add(part.psd(f))
         return rows
-
-    def _drawn(self, stream: Stream, steps: int, part: int) -> Any:
-        # The first part draws what it would draw alone, so that a tremor can be added to a path.
-        return tuple(each._drawn(stream, steps, part + i) for i, each in enumerate(self.parts))
-
-    def realise(self, normals: Any, dt: Scalar) -> Realisation:
-        return Realisation(
-            parts=tuple(p.realise(own, dt) for p, own in zip(self.parts, normals, strict=True))
-        )
 
     def recursion(self, dt: Scalar) -> Recursion:
         raise ValueError("a sum of noises has a recursion for each of its components")

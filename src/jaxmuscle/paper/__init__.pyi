@@ -1,6 +1,5 @@
 """Public names of this wing."""
 
 from ._claims import check as check
-from ._numbers import given_recordings as given_recordings
 from ._reproduce import reproduce as reproduce
 from ._verdicts import counted as counted

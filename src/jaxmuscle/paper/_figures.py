@@ -34,6 +34,7 @@ SIZE = (4.2, 2.9)  # inches: letters of 8 points are 10 pixels high on a phone o
 DPI = 200
 PROPORTIONAL = "Proportional power"
 PER_BIN = f"{PROPORTIONAL} (per bin)"
+SIMULATED = "Simulated recordings"
 FORCE = r"Force $P_\mathrm{w}$"
 Times = Float[np.ndarray, " times"]
 
@@ -147,10 +148,6 @@ def _frequency(ax: Axes, log: bool) -> None:
     ax.set_xticks([], minor=True)
 
 
-def _source(experiment: Experiment) -> str:
-    return "Simulated recordings" if experiment.simulated else "Your recordings"
-
-
 def _fft_and_welch(people: Experiment) -> Figure:
     """FFT above Welch."""
     figure, axes = _panels(2, height=4.6)
@@ -162,7 +159,7 @@ def _fft_and_welch(people: Experiment) -> Figure:
             style: Style = {"color": colour, "lw": width, "alpha": 0.8, "label": recording.name}
             ax.plot(spectrum.frequency, spectrum.proportional, **style)
         step = float(np.diff(spectra[0].frequency)[0])
-        ax.set_title(f"{_source(people)}: {title}, {step:.4f} Hz")
+        ax.set_title(f"{SIMULATED}: {title}, {step:.4f} Hz")
         _frequency(ax, log=True)
         ax.set_ylabel(PER_BIN)
     axes[1, 0].legend(loc="lower left")
@@ -187,7 +184,7 @@ def _pairs(people: Experiment) -> Figure:
             ax.set_aspect("equal", adjustable="datalim")
             _decades(ax, ends)
             ax.set(xlabel=f"person {i + 1}", ylabel=f"person {j + 1}")
-    words = f"{_source(people)}: {PROPORTIONAL.lower()} of two people"
+    words = f"{SIMULATED}: {PROPORTIONAL.lower()} of two people"
     figure.suptitle(words, x=0.01, ha="left", fontsize=8)
     return figure
 

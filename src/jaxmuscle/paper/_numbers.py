@@ -1,8 +1,7 @@
 """What `jaxmuscle reproduce` computes: the numbers behind the paper's figures and statements."""
 
 import itertools
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -97,12 +96,11 @@ class Regularity(eqx.Module):
 class Experiment(eqx.Module):
     """Three people's recordings and their spectra, whole recording ("FFT") against Welch.
 
-    **Fields:** `recordings`; `simulated`; `fft`, `welch`; `rho_fft`, `rho_welch`, Spearman
+    **Fields:** `recordings`; `fft`, `welch`; `rho_fft`, `rho_welch`, Spearman
     correlations of the pairs.
     """
 
     recordings: tuple[Recording, ...]
-    simulated: bool = eqx.field(static=True)
     fft: tuple[Spectrum, ...]
     welch: tuple[Spectrum, ...]
 
@@ -233,34 +231,10 @@ def simulated_recordings() -> tuple[Recording, ...]:
     )
 
 
-def given_recordings(
-    recordings: Sequence[Recording | str | os.PathLike[str]],
-) -> tuple[Recording, ...]:
-    """Three recordings, files loaded, cut to the length of the shortest so that their spectra have
-    the same bins."""
-    from jaxmuscle.data._recording_files import load_recording
-
-    if isinstance(recordings, str | os.PathLike):
-        recordings = [recordings]
-    if len(recordings) != 3:
-        raise ValueError(
-            f"recordings: {len(recordings)} given, three are compared: give one for each of three"
-            " people"
-        )
-    loaded = [r if isinstance(r, Recording) else load_recording(r) for r in recordings]
-    quantities = [str(r.quantity) for r in loaded]
-    if len(set(quantities)) > 1:
-        raise ValueError(f"recordings of {', '.join(quantities)}: give three of the same quantity")
-    shortest = min(r.duration for r in loaded)
-    begins = [float(r.time[0]) for r in loaded]
-    return tuple(r.steady((t, t + shortest)) for r, t in zip(loaded, begins, strict=True))
-
-
-def experiment(given: tuple[Recording, ...] | None = None) -> Experiment:
+def experiment(people: tuple[Recording, ...]) -> Experiment:
     """Spectra of three people, resampled to 100 Hz so that 256 points give the stated 0.39 Hz."""
-    people = simulated_recordings() if given is None else given
     fft, welch = (r.fft_spectrum(RECORDED) for r in people), (r.spectrum(RECORDED) for r in people)
-    return Experiment(people, given is None, tuple(fft), tuple(welch))
+    return Experiment(people, tuple(fft), tuple(welch))
 
 
 class Reproduction(eqx.Module):
@@ -280,9 +254,7 @@ class Reproduction(eqx.Module):
     readings: tuple[Reading, ...]
 
 
-def compute(
-    given: tuple[Recording, ...] | None = None, report: Progress = lambda text, share: None
-) -> Reproduction:
+def compute(report: Progress) -> Reproduction:
     """All numbers, in float64; nothing is written."""
     with jax.enable_x64(True):
         report("Task 1 and 2, zagrodny-slifkin", 0.0)
@@ -295,7 +267,7 @@ def compute(
         report("comparison signals", 0.45)
         compared = regularity(slifkin.force)
         report("three people", 0.5)
-        people = experiment(given)
+        people = experiment(simulated_recordings())
         tuned_runs = experiment(record(slifkin.displacement.task, seeds=3))
         report("three readings", 0.6)
         judged = readings(slifkin.force.task)

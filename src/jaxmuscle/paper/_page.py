@@ -89,12 +89,9 @@ def _caption(name: str, experiment: Experiment) -> str:
     if name not in ("fig7", "fig8"):
         return CAPTIONS[name]
     names = ", ".join(escape(r.name) for r in experiment.recordings)
-    simulated = (
-        "<b>Simulated, not measured</b>: displacement in Task 2 with Ornstein-Uhlenbeck noise,"
-        " parameters 10 % apart: "
-    )
     return (
-        f"{CAPTIONS[name]} {simulated if experiment.simulated else 'Your own recordings: '}{names}."
+        f"{CAPTIONS[name]} <b>Simulated, not measured</b>: displacement in Task 2 with"
+        f" Ornstein-Uhlenbeck noise, parameters 10 % apart: {names}."
     )
 
 

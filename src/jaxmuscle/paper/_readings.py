@@ -131,7 +131,10 @@ def readings(preset: AbstractTask) -> tuple[Reading, ...]:
     Figures 2 to 5."""
     isometric = "a harmonic at 0.391 Hz, a resonance near 4.25 Hz (isometric: two states)"
     leaking = "no slow part; the mean leaks into bin 1 (pwelch: Hamming, no detrend)"
-    slow, pwelch = "a transient slower than the window, mean removed", SpectrumSettings.pwelch()
+    slow, pwelch = (
+        "a transient slower than the window, mean removed",
+        SpectrumSettings.named("pwelch"),
+    )
     held = preset.replace(harmonic_frequency=LOW)
     return (
         _judge("A", "a harmonic at 4.25 Hz on slow relaxation", preset),

@@ -13,7 +13,6 @@ from jaxtyping import Array, Integer, PRNGKeyArray
 
 from jaxmuscle._common.environment import usable_cores
 from jaxmuscle._common.programs import kept
-from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._decimation import at_every
@@ -69,23 +68,9 @@ def threads_of(wanted: int | None) -> int:
     return min(threads, max(1, usable_cores() - 1)) if jax.__version__ in WAITING else threads
 
 
-def respond(
-    task: AbstractTask, source: Stream | Realisation, grid: Grid, sampling: str
-) -> tuple[Array, Array]:
-    """States (samples, states), at instants, and sampled output (samples) of one noise path, drawn
-    or given."""
-    from ._integrator import integrated  # and diffrax, which a program that is loaded does without
-
-    states, (output,) = integrated(
-        (task,), jax.tree.map(lambda x: x[None], source), grid, sampling, states=True
-    )
-    assert states is not None
-    return states[0], output[0]
-
-
 def _responses(task: AbstractTask, linear: Any, sources: Stream, recipe: Recipe) -> dict[str, Any]:
     """Of all seeds' random numbers along a leading axis."""
-    from ._integrator import integrated
+    from ._integrator import integrated  # and diffrax, which a program that is loaded does without
 
     tasks = (task,) if linear is None else (task, linear)
     states, outputs = integrated(tasks, sources, recipe.grid, recipe.sampling, states=recipe.states)

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.types import Scalar
-from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._signals import AbstractSignal, Constant, Tabulated
 from jaxmuscle.model._stream import Stream
 from jaxmuscle.model._tasks import AbstractTask
@@ -126,7 +125,7 @@ class GridTerm(dfx.AbstractTerm):
                 )
 
             numbers = control + jnp.arange(self.grid.every, dtype=jnp.int32)
-            made = perturbation.path.ahead(control, self.grid.every)
+            made = perturbation.ahead(control, self.grid.every)
             (tasks, path), seen = jax.lax.scan(step, (y.tasks, y.perturbation), (numbers, made))
             return Moving(tasks, path, seen)
 
@@ -244,22 +243,21 @@ class Response(NamedTuple):
 
 def integrated(
     tasks: tuple[AbstractTask, ...],
-    sources: Stream | Realisation,
+    streams: Stream,
     grid: Grid,
     sampling: str,
     *,
     states: bool,
     loud: Float[Array, " seeds"] | None = None,
 ) -> Response:
-    """Tasks that share a perturbation (a task and its linearisation), on the seeds' random numbers
-    or on given unit paths.
+    """Tasks that share a perturbation (a task and its linearisation), on the seeds' random numbers.
 
-    `sources` have a leading axis of seeds; `loud` multiplies the noise of each. What overflows is
+    `streams` have a leading axis of seeds; `loud` multiplies the noise of each. What overflows is
     not finite, never an exception.
     """
     instants = sampling == "instant"
     looked_up = (tabulated(tasks[0], grid), *tasks[1:])
-    own, shared = Perturbation.of(tasks[0], sources, grid.dt).apart(loud)
+    own, shared = Perturbation.of(tasks[0], streams, grid.dt).apart(loud)
     term = GridTerm(tasks, looked_up, own, shared, grid, instants)
     begun = term.start()
 

@@ -8,7 +8,6 @@ from ._measures import coefficient_of_variation as coefficient_of_variation
 from ._measures import peak_frequency as peak_frequency
 from ._measures import peaks as peaks
 from ._measures import sample_entropy as sample_entropy
-from ._measures import signal_to_noise as signal_to_noise
 from ._peak_test import Peak as Peak
 from ._peak_test import PeakTest as PeakTest
 from ._peak_test import find_peaks as find_peaks

@@ -19,13 +19,6 @@ from ._welch import Spectrum, floating
 Counts = Int[np.ndarray, " _"]
 
 
-def _standard_deviation(signal: Float[Array, "*batch times"]) -> Float[Array, "*batch"]:
-    variance = jnp.var(signal, axis=-1)
-    # The root has no derivative at zero; a constant signal gets zero instead of NaN.
-    positive = variance > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1.0)), 0.0)
-
-
 def coefficient_of_variation(
     signal: Real[Array | np.ndarray, "*batch times"],
 ) -> Float[Array, "*batch"]:
@@ -42,25 +35,11 @@ def coefficient_of_variation(
     **Raises:** `ValueError` for a signal without samples.
     """
     signal = floating(signal)
-    return _standard_deviation(signal) / jnp.abs(jnp.mean(signal, axis=-1))
-
-
-def signal_to_noise(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch"]:
-    """Signal-to-noise ratio, SNR = μ / σ, along the last axis; differentiable.
-
-        jm.spectra.signal_to_noise(5 + np.sin(np.arange(1000.0)))
-
-    **Arguments:** `signal` in any unit, time along the last axis. σ divides by the number of
-    samples.
-
-    **Returns:** a ratio without unit and with the sign of the mean; infinite for a constant signal.
-
-    **Raises:** `ValueError` for a signal without samples.
-
-    **Source:** Slifkin & Newell 1999, J Exp Psychol HPP 25(3):837-851.
-    """
-    signal = floating(signal)
-    return jnp.mean(signal, axis=-1) / _standard_deviation(signal)
+    variance = jnp.var(signal, axis=-1)
+    # The root has no derivative at zero; a constant signal gets zero instead of NaN.
+    positive = variance > 0
+    deviation = jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1.0)), 0.0)
+    return deviation / jnp.abs(jnp.mean(signal, axis=-1))
 
 
 def _counts(

@@ -121,21 +121,15 @@ class SpectrumSettings(Spelled, eqx.Module):
         | `"multitaper"` | the same with three Slepian tapers (NW = 2, bands of 0.4 Hz) from 0.2 Hz on |
         | `"pwelch"` | MATLAB's defaults: Hamming window and no detrend, so the mean leaks into bin 1 |
 
+        Of `"pwelch"` two details stay as they are here: `length` (MATLAB would cut the signal into
+        eight segments) and the periodic form of the window (MATLAB's is symmetric).
+
         **Raises:** `ValueError` for another name. **Source:** Thomson 1982,
         doi:10.1109/PROC.1982.12433 (multitaper).
         """  # noqa: E501 (a row of a table is one line)
         known = isinstance(name, str) and name in NAMED
         require(known, "settings", name, choices(str(name), NAMED))
         return cls(**NAMED[name])
-
-    @classmethod
-    def pwelch(cls) -> "SpectrumSettings":
-        """MATLAB's `pwelch` defaults, `named("pwelch")`.
-
-        Two details stay as they are here: `length` (MATLAB would cut the signal into eight
-        segments) and the periodic form of the window (MATLAB's is symmetric).
-        """
-        return cls.named("pwelch")
 
     @property
     def name(self) -> str | None:
