@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Unpack, overload
 
-from jaxmuscle._common.arguments import require
+from jaxmuscle._common.arguments import check_options, require
 from jaxmuscle._common.files import expanded
 from jaxmuscle._common.inputs import BEYOND, looked_at, most, read_bytes
 from jaxmuscle._common.text import choices
@@ -18,7 +18,6 @@ from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_choice import Reading, ReadingOptions, perturbed_of, recording_of, signals
 from ._recording_csv import read_csv
-from ._recording_quality import Baseline
 from ._recording_table import Table, channels_table, find
 from ._recording_time import clock
 from ._text_tables import LOOK, TEXT, holds_text
@@ -39,28 +38,17 @@ def load_recording(
 def load_recording(
     path: str | os.PathLike[str] | Table, *, force: str | int, **options: Any
 ) -> PerturbedRecording: ...
-def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsistentOverload]
+def load_recording(  # pyright: ignore[reportInconsistentOverload]
     path: str | os.PathLike[str] | Table,
     *,
-    column: str | int | None = None,
     force: str | int | None = None,
     displacement: str | int | None = None,
-    rate: float | int | None = None,
-    units: str | None = None,
-    axis: str | None = None,
-    reference: str | int | None = None,
-    time: str | int | None = None,
-    skip_rows: int = 0,
-    sheet: str | int | None = None,
-    max_gap: float | int = 0.2,
-    outliers: str = "keep",
     displacement_units: str | None = None,
-    lever_arm: float | int | None = None,
     positive: str | None = None,
     delay: float | int = 0.0,
-    quantity: str | None = None,
-    baseline: Baseline = None,
-    detrend: bool = False,
+    skip_rows: int = 0,
+    sheet: str | int | None = None,
+    **options: Unpack[ReadingOptions],
 ) -> Recording | PerturbedRecording:
     """Load a recording from text, Excel, MATLAB, NumPy, C3D, EDF, TDMS, AcqKnowledge or Spike2
     files.
@@ -115,36 +103,22 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
     **Raises:** `ValueError` naming file, line or argument, and the remedy; `ImportError` that says
     what to install.
     """
-    reading = Reading(
-        column,
-        rate,
-        units,
-        axis,
-        reference,
-        time,
-        max_gap,
-        lever_arm,
-        outliers,
-        quantity,
-        baseline,
-        detrend,
-    )
-    options = {"displacement_units": displacement_units, "positive": positive, "delay": delay}
+    check_options(load_recording, ReadingOptions, options)
+    reading = Reading(**options)
+    both = {"displacement_units": displacement_units, "positive": positive, "delay": delay}
     if force is None or displacement is None:
         remedy = "belongs to recordings of two channels; give `force` and `displacement`"
-        strange = {"force": force, "displacement": displacement, **options, "delay": delay or None}
+        strange = {"force": force, "displacement": displacement, **both, "delay": delay or None}
     else:
         remedy = "leave it out: `force` and `displacement` name the columns"
-        strange = {"column": column, "axis": axis, "reference": reference, "quantity": quantity}
+        strange = {name: options.get(name) for name in ("column", "axis", "reference", "quantity")}
     for name, value in strange.items():
         require(value is None, name, value, remedy)
     table = read_table(path, skip_rows, sheet)
     if force is None or displacement is None:
         return recording_of(Recording, table, reading)
     columns = {"force": force, "displacement": displacement}
-    return perturbed_of(
-        PerturbedRecording.from_array, table, reading, columns, lever_arm=lever_arm, **options
-    )
+    return perturbed_of(PerturbedRecording.from_array, table, reading, columns, **both)
 
 
 def load_columns(
