@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from jaxmuscle._common import bundled as _bundled
 from jaxmuscle._common.bundled import describe_targets, list_targets
 from jaxmuscle._common.errors import TargetError
-from jaxmuscle.data import Recording, kind_of_file
+from jaxmuscle.data import Recording
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -383,7 +383,6 @@ def test_names_that_programs_give_and_a_row_at_0_hz(header, tmp_path):
     target = load_target(path)
     np.testing.assert_allclose(target.proportional_power, POWER[1:31] / POWER[1:31].sum())
     assert "the row at 0 Hz is the mean, and is left out" in target.notices
-    assert kind_of_file(path) == "spectrum"
 
 
 @pytest.mark.parametrize(
@@ -421,12 +420,6 @@ def test_coarse_frequencies_are_not_thirty_numbers(step, tmp_path):
     off = np.abs(target.frequency[:, None] - inside).min(axis=1)
     assert np.all(off <= 0.5 * 0.390625 + 1e-9)
     assert any("interpolated powers are no measurements" in notice for notice in target.notices)
-
-
-def test_a_force_called_f_is_a_recording(tmp_path):
-    time = np.arange(3000) / 100
-    path = write(tmp_path, spectrum_text("time,f", time, 20 + np.sin(time)))
-    assert kind_of_file(path) == "recording"
 
 
 HEADER = "frequency_hz,proportional_power\n"

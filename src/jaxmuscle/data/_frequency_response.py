@@ -2,6 +2,7 @@
 errors."""
 
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Unpack
@@ -26,6 +27,10 @@ Numbers = list[float]
 Bins = Float[np.ndarray, " bins"]
 UNSEEN = 1e-3  # how probable by chance a response may be at most, to be one
 SQUARED = "give the squared coherence, 0 to 1"
+FITTED = ("frequency_hz", "real", "imaginary", "stderr")  # columns of stiffness.csv
+HEADER = re.compile(
+    r"(frequency|freq|f|gain|phase|coherence|stderr)(?:[ _/]*[\[(]?([^\[\]()]*?)[\])]?)"
+)
 COLUMNS = ("frequency_hz", "gain_N/m", "phase_deg", "stderr_N/m", "coherence")
 
 

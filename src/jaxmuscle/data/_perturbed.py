@@ -23,7 +23,7 @@ from ._frequency_response import FrequencyResponse
 from ._measure import Measure, normal_interval
 from ._recording import Recording, pooled_target, recorded_settings
 from ._recording_choice import About
-from ._recording_quality import Baseline
+from ._recording_quality import Baseline, signal_of
 from ._second_order import SecondOrder, lateness, lengthens, second_order_fit
 from ._target import Target
 from ._units import scale_to_si
@@ -183,7 +183,7 @@ class PerturbedRecording(Shown, eqx.Module):
         )
         remedy = f"leave it out: {units} and {displacement_units} need none"
         require(lever_arm is None or turned or swung, "lever_arm", lever_arm, remedy)
-        pull, moved = _signal("force", force), _signal("displacement", displacement)
+        pull, moved = signal_of("force", force), signal_of("displacement", displacement)
         _check_length(pull.size, moved.size)
         if np.isfinite(moved).all() and _is_constant(moved):
             raise ValueError(
@@ -384,15 +384,6 @@ class PerturbedRecording(Shown, eqx.Module):
         ]
         size = f"{force.whole.size} samples at {self.rate:g} Hz"
         return facts(f"{self.name}: force [N] and lengthening [m], {size}", known)
-
-
-def _signal(name: str, values: Any) -> Times:
-    try:
-        signal = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: give real numbers, one for each time") from None
-    require(signal.ndim == 1, f"{name} shape", signal.shape, "give one signal")
-    return signal
 
 
 def _check_length(force: int, moved: int) -> None:

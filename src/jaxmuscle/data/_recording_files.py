@@ -9,25 +9,19 @@ from pathlib import Path
 from typing import Any, Unpack, overload
 
 from jaxmuscle._common.arguments import check_options, require
-from jaxmuscle._common.files import expanded
 from jaxmuscle._common.inputs import BEYOND, looked_at, most, read_bytes
 from jaxmuscle._common.text import choices
 
 from ._apart import read_apart
+from ._file_kinds import BOOKS, KINDS, LOOK, ROWS, look_at
 from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_choice import Reading, ReadingOptions, perturbed_of, recording_of, signals
 from ._recording_csv import read_csv
 from ._recording_table import Table, channels_table, find
 from ._recording_time import clock
-from ._text_tables import LOOK, TEXT, holds_text
+from ._text_tables import holds_text
 from .dialects._dialects import EXPORTS
-
-BOOKS = (".xlsx", ".xlsm")
-BINARY = (".mat", ".npy", ".npz", ".c3d", ".edf", ".bdf", ".tdms", ".acq", ".smr")
-KINDS = (*TEXT, ".xlsx", *BINARY, ".xlsm", ".gz")
-TARGETS = (".toml", ".json")
-ROWS = 90  # that the shortest recording has
 
 
 @overload
@@ -192,12 +186,10 @@ def read_tables(
     if isinstance(path, Table):
         return [path]
     require(isinstance(path, str | os.PathLike), "path", path, "give the path of a recording")
-    file = expanded(path)
-    kind = file.suffix.lower()
+    file, kind, text, _ = look_at(path)
     whole = isinstance(skip_rows, int) and skip_rows >= 0
     require(whole, "skip_rows", skip_rows, "give a number of lines")
     instead = f"a recording ({', '.join(KINDS)})"
-    text = kind in TEXT or is_text(file)
     book = kind in BOOKS and not text
     rows = text or book or kind == ".gz"
     require(skip_rows == 0 or rows, "skip_rows", skip_rows, f"leave it out: {kind} has no lines")
@@ -217,16 +209,6 @@ def read_tables(
     if isinstance(found, dict):
         return _sheets(file, found, skip_rows, sheet)
     return [channels_table(str(file), found, named=kind != ".npy")]
-
-
-def is_text(file: Path) -> bool:
-    """Whether a file is a text with rows of numbers, though its ending does not say so."""
-    kind = file.suffix.lower()
-    if (kind in (*TARGETS, *KINDS) and kind != ".mat") or not file.is_file():
-        return False
-    with contextlib.suppress(OSError), file.open("rb") as stream:
-        return holds_text(stream.read(LOOK))
-    return False
 
 
 def _unpacked(file: Path, instead: str) -> bytes:
