@@ -286,9 +286,8 @@ def test_no_extrapolation(tmp_path):
     np.testing.assert_array_equal(target.bins, [3, 5, 10])
     np.testing.assert_array_equal(target.frequency, GRID[[2, 4, 9]])
     assert target.proportional_power.sum() == pytest.approx(1, abs=1e-12)
-    assert any(
-        "no value in the bins 1 to 2, 4, 6 to 9, 11 to 30, so these are left out" in notice
-        for notice in target.notices
+    assert noticed(
+        target, "no value in the bins 1 to 2, 4, 6 to 9, 11 to 30, so these are left out"
     )
 
 
@@ -419,7 +418,7 @@ def test_coarse_frequencies_are_not_thirty_numbers(step, tmp_path):
     assert len(target.bins) <= inside.size
     off = np.abs(target.frequency[:, None] - inside).min(axis=1)
     assert np.all(off <= 0.5 * 0.390625 + 1e-9)
-    assert any("interpolated powers are no measurements" in notice for notice in target.notices)
+    assert noticed(target, "interpolated powers are no measurements")
 
 
 HEADER = "frequency_hz,proportional_power\n"
