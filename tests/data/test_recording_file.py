@@ -320,18 +320,6 @@ def test_c3d(tmp_path):
     assert_reads(load_recording(path, column="channel 1", units="N"), force + 1, 1000.0, "N")
 
 
-def without_ezc3d(tmp_path, monkeypatch):
-    """Files are read in a process of its own, which finds modules where this one does."""
-    write(tmp_path, b"raise ImportError", "ezc3d.py")
-    monkeypatch.syspath_prepend(tmp_path)
-
-
-def test_c3d_without_library(tmp_path, monkeypatch):
-    without_ezc3d(tmp_path, monkeypatch)
-    with pytest.raises(ImportError, match=r"reading C3D needs ezc3d: pip install ezc3d"):
-        load_recording(write(tmp_path, b"c3d", "trial.c3d"))
-
-
 H = "time,force\n"
 ROWS = text(TIME, X)
 HOLE = text(TIME / 0.1, [*map(str, X[:10]), *[""] * 25, *map(str, X[35:])], header="time,force")
@@ -693,6 +681,7 @@ def test_command_exits_with_2_and_one_line(arguments, message, tmp_path):
 
 
 def test_command_without_ezc3d(tmp_path, monkeypatch):
-    without_ezc3d(tmp_path, monkeypatch)
+    write(tmp_path, b"raise ImportError", "ezc3d.py")
+    monkeypatch.syspath_prepend(tmp_path)
     done = run(write(tmp_path, b"c3d", "trial.c3d"), "--out", tmp_path / "out")
     assert done.exit_code == 2 and "pip install ezc3d" in " ".join(done.output.split())

@@ -9,6 +9,7 @@ import pytest
 import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
+from recorded import noticed
 
 from jaxmuscle._common import bundled as _bundled
 from jaxmuscle._common.bundled import describe_targets, list_targets

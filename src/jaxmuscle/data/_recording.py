@@ -182,7 +182,7 @@ class Recording(Shown, eqx.Module):
 
     def _with(self, **changed: Any) -> "Recording":
         """The recording with other arguments; its level at rest is subtracted already."""
-        # of which pauses cut it off the window does not need to know any more
+        # parts beyond a pause are parts of the file, not of what is made of one of them
         kept = {key: value for key, value in vars(self).items() if key not in ("whole", "others")}
         return Recording(**{"samples": self.whole, "baseline": "none"} | kept | changed)
 
