@@ -28,6 +28,44 @@ def save_columns(path: Path, header: str, *columns: Any, fmt: str | list[str] = 
     return path
 
 
+def save_mat73(path: Path, variables: dict[str, Any]) -> Path:
+    """As MATLAB saves with -v7.3: arrays transposed, texts as numbers, cells as references."""
+    import h5py
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        refs = file.create_group("#refs#")
+
+        def put(group: Any, name: str, value: Any) -> None:
+            if isinstance(value, dict):
+                inner = group.create_group(name)
+                for key, each in value.items():
+                    put(inner, key, each)
+            elif isinstance(value, str):
+                item = group.create_dataset(
+                    name, data=np.array([[ord(c)] for c in value], np.uint16)
+                )
+                item.attrs["MATLAB_class"] = np.bytes_("char")
+            elif isinstance(value, np.ndarray) and value.dtype == object:
+                cells = group.create_dataset(name, value.shape[::-1], dtype=h5py.ref_dtype)
+                for i, each in enumerate(value.ravel()):
+                    put(refs, f"{name}{i}", each)
+                    cells[np.unravel_index(i, cells.shape)] = refs[f"{name}{i}"].ref
+            elif isinstance(value, np.ndarray) and value.dtype.kind == "U":
+                codes = np.array(
+                    [[ord(c) for c in line.ljust(value.dtype.itemsize // 4)] for line in value]
+                )
+                item = group.create_dataset(name, data=codes.T.astype(np.uint16))
+                item.attrs["MATLAB_class"] = np.bytes_("char")
+            else:
+                group[name] = np.atleast_2d(np.asarray(value)).T
+
+        for name, value in variables.items():
+            put(file, name, value)
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\0\2IM"
+    path.write_bytes(head.ljust(512, b"\0") + path.read_bytes()[512:])
+    return path
+
+
 def noticed(given: Any, words: str) -> bool:
     """Whether a notice of a recording, or of whatever has notices, holds these words."""
     return any(words in notice for notice in given.notices)

@@ -4,15 +4,13 @@ words. The layouts are those of the programs; the numbers are made here."""
 import gzip
 import json
 
-import h5py
 import numpy as np
 import pandas
 import pytest
 import scipy.io
-from recorded import assert_reads, noticed, refused, rows, write
+from recorded import assert_reads, noticed, refused, rows, save_mat73, write
 
 from jaxmuscle._common.inputs import ALLOWED
-from jaxmuscle.data._as_target import kind_of_file
 from jaxmuscle.data._recording_channels import Channel
 from jaxmuscle.data._recording_choice import signals
 from jaxmuscle.data._recording_files import load_columns, load_recording, read_table
@@ -715,46 +713,11 @@ def test_blocks_of_labchart_are_trials(tmp_path):
     assert (first.name, first.unit, first.rate) == ("trial Force, block 1", "kgf", RATE)
 
 
-def save73(path, variables):
-    """As MATLAB saves with -v7.3: arrays transposed, texts as numbers, cells as references."""
-    with h5py.File(path, "w", userblock_size=512) as file:
-        refs = file.create_group("#refs#")
-
-        def put(group, name, value):
-            if isinstance(value, dict):
-                inner = group.create_group(name)
-                for key, each in value.items():
-                    put(inner, key, each)
-            elif isinstance(value, str):
-                item = group.create_dataset(
-                    name, data=np.array([[ord(c)] for c in value], np.uint16)
-                )
-                item.attrs["MATLAB_class"] = np.bytes_("char")
-            elif isinstance(value, np.ndarray) and value.dtype == object:
-                cells = group.create_dataset(name, value.shape[::-1], dtype=h5py.ref_dtype)
-                for i, each in enumerate(value.ravel()):
-                    put(refs, f"{name}{i}", each)
-                    cells[np.unravel_index(i, cells.shape)] = refs[f"{name}{i}"].ref
-            elif isinstance(value, np.ndarray) and value.dtype.kind == "U":
-                codes = np.array(
-                    [[ord(c) for c in line.ljust(value.dtype.itemsize // 4)] for line in value]
-                )
-                item = group.create_dataset(name, data=codes.T.astype(np.uint16))
-                item.attrs["MATLAB_class"] = np.bytes_("char")
-            else:
-                group[name] = np.atleast_2d(np.asarray(value)).T
-
-        for name, value in variables.items():
-            put(file, name, value)
-    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\0\2IM"
-    path.write_bytes(head.ljust(512, b"\0") + path.read_bytes()[512:])
-
-
 @pytest.mark.parametrize(
     "case", [name for name in MATS if not name.startswith("rate from") and "missing" not in name]
 )
 def test_mat_of_programs_in_version_73(case, tmp_path):
-    save73(tmp_path / "trial.mat", MATS[case][0])
+    save_mat73(tmp_path / "trial.mat", MATS[case][0])
     assert_mat(tmp_path / "trial.mat", case)
 
 
@@ -774,7 +737,6 @@ def test_variables_of_npz(tmp_path):
 def test_texts_by_their_content(name, tmp_path):
     path = write(tmp_path, "time\tForce (N)\n" + rows(TIME, X, sign="\t"), name)
     np.testing.assert_array_equal(load_recording(path).whole, X)
-    assert name == "a.mat" or kind_of_file(path) == "recording"
 
 
 def test_packed_texts(tmp_path, monkeypatch):
@@ -782,7 +744,7 @@ def test_packed_texts(tmp_path, monkeypatch):
     path = write(tmp_path, gzip.compress(text.encode()), "trial.csv.gz")
     recording = load_recording(path, column="Fz")
     np.testing.assert_array_equal(recording.whole, X)
-    assert recording.rate == RATE and kind_of_file(path) == "recording"
+    assert recording.rate == RATE
     utf16 = write(tmp_path, gzip.compress(text.encode("utf-16")), "trial.txt.gz")
     np.testing.assert_array_equal(load_recording(utf16, column="Fz", skip_rows=0).whole, X)
     for content, message in (

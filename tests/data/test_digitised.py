@@ -7,6 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pages
 import pytest
+from recorded import noticed
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
@@ -61,10 +62,7 @@ def test_power_law_is_straight_between_points_of_a_log_log_figure(tmp_path):
     np.testing.assert_array_equal(target.bins, [1, 5])
     law = target.frequency**-1.7
     np.testing.assert_allclose(target.proportional_power, law / law.sum(), rtol=1e-6)
-    assert any(
-        "the log power was interpolated over log frequency (widest gap 11 Hz)" in notice
-        for notice in target.notices
-    )
+    assert noticed(target, "the log power was interpolated over log frequency (widest gap 11 Hz)")
 
 
 def test_ends_within_a_pixel_are_not_lost(tmp_path):

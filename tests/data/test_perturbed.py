@@ -9,6 +9,7 @@ import pages
 import pytest
 import scipy.signal
 import scipy.stats
+from recorded import noticed
 from refits import without_intervals
 from typer.testing import CliRunner
 
@@ -253,7 +254,7 @@ def test_a_delay_is_found_and_taken_out():
     assert whole.force.start == whole.displacement.start == pytest.approx(1.008)
     back, error = whole.delay(FINE)
     assert abs(back) < CHANCE * error
-    assert any("lags by 8 ms" in notice for notice in whole.notices)
+    assert noticed(whole, "lags by 8 ms")
     (said,) = late.late(FINE)
     assert re.match(
         r"the force comes [78]\.?\d* ± \S+ ms late, beyond what a spring", said
@@ -302,9 +303,7 @@ def test_sign():
     straight, turned = recorded(moved[0], force[0]), recorded(-moved[0], force[0])
     np.testing.assert_array_equal(straight.displacement.whole, turned.displacement.whole)
     assert not straight.notices
-    assert any(
-        "counts shortening as positive: its sign is turned" in notice for notice in turned.notices
-    )
+    assert noticed(turned, "counts shortening as positive: its sign is turned")
     np.testing.assert_array_equal(
         recorded(moved[0], force[0], positive="shortening").displacement.whole, -moved[0]
     )
@@ -322,11 +321,9 @@ def test_sign():
         (size,) = recorded(factor * moved[0], force[0] / factor).notices
         assert size.endswith(f"give --displacement-units {unit} (Python: displacement_units=)")
     unrelated = recorded(moved[0], force[0, ::-1])
-    assert any(
-        "--positive lengthening or --positive shortening" in notice for notice in unrelated.notices
-    )
+    assert noticed(unrelated, "--positive lengthening or --positive shortening")
     short = recorded(moved[0, :300], force[0, :300])
-    assert any("sign of the displacement is not checked" in notice for notice in short.notices)
+    assert noticed(short, "sign of the displacement is not checked")
     with pytest.raises(ValueError, match="positive='up'"):
         recorded(moved[0], force[0], positive="up")
 
@@ -476,7 +473,7 @@ def test_gaps_are_closed_in_both(tmp_path):
     found = jm.load_recording(path, force="force", displacement="way")
     assert found.force.whole.size == found.displacement.whole.size == 5996
     assert found.displacement.start == 0.04
-    assert any("closed by straight lines" in notice for notice in found.notices)
+    assert noticed(found, "closed by straight lines")
 
 
 REFUSED = {

@@ -464,14 +464,8 @@ def test_trials_that_are_no_trials_of_one_condition_are_noticed():
     assert (
         "a and again hold the same numbers" in jm.data.steadiness([first, twice, second]).notices[0]
     )
-    assert any(
-        "a and again hold the same numbers" in notice
-        for notice in jm.data.Trials([first, twice]).target().notices
-    )
-    assert any(
-        "are they of one condition" in notice
-        for notice in jm.data.Trials([first, strong]).target().notices
-    )
+    assert noticed(jm.data.Trials([first, twice]).target(), "a and again hold the same numbers")
+    assert noticed(jm.data.Trials([first, strong]).target(), "are they of one condition")
     assert not jm.data.Trials([first, second]).target().notices
 
 

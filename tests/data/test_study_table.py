@@ -184,6 +184,7 @@ def test_an_mvc_that_is_no_number(folder):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("# pilot\n", r"study.csv: holds no data, only comments"),
         ("file,group\na1.npy,old\n", r"study.csv: line 1: no column person"),
         ("file,persn\na1.npy,anna\n", r"line 1: unknown column 'persn'; did you mean 'person'\?"),
         ("file,person,file\na1.npy,anna,b\n", r"line 1: two columns are called file"),

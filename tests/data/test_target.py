@@ -9,11 +9,12 @@ import pytest
 import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
+from recorded import noticed
 
 from jaxmuscle._common import bundled as _bundled
 from jaxmuscle._common.bundled import describe_targets, list_targets
 from jaxmuscle._common.errors import TargetError
-from jaxmuscle.data import Recording, kind_of_file
+from jaxmuscle.data import Recording
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -286,9 +287,8 @@ def test_no_extrapolation(tmp_path):
     np.testing.assert_array_equal(target.bins, [3, 5, 10])
     np.testing.assert_array_equal(target.frequency, GRID[[2, 4, 9]])
     assert target.proportional_power.sum() == pytest.approx(1, abs=1e-12)
-    assert any(
-        "no value in the bins 1 to 2, 4, 6 to 9, 11 to 30, so these are left out" in notice
-        for notice in target.notices
+    assert noticed(
+        target, "no value in the bins 1 to 2, 4, 6 to 9, 11 to 30, so these are left out"
     )
 
 
@@ -383,7 +383,6 @@ def test_names_that_programs_give_and_a_row_at_0_hz(header, tmp_path):
     target = load_target(path)
     np.testing.assert_allclose(target.proportional_power, POWER[1:31] / POWER[1:31].sum())
     assert "the row at 0 Hz is the mean, and is left out" in target.notices
-    assert kind_of_file(path) == "spectrum"
 
 
 @pytest.mark.parametrize(
@@ -420,13 +419,7 @@ def test_coarse_frequencies_are_not_thirty_numbers(step, tmp_path):
     assert len(target.bins) <= inside.size
     off = np.abs(target.frequency[:, None] - inside).min(axis=1)
     assert np.all(off <= 0.5 * 0.390625 + 1e-9)
-    assert any("interpolated powers are no measurements" in notice for notice in target.notices)
-
-
-def test_a_force_called_f_is_a_recording(tmp_path):
-    time = np.arange(3000) / 100
-    path = write(tmp_path, spectrum_text("time,f", time, 20 + np.sin(time)))
-    assert kind_of_file(path) == "recording"
+    assert noticed(target, "interpolated powers are no measurements")
 
 
 HEADER = "frequency_hz,proportional_power\n"

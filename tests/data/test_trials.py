@@ -15,7 +15,7 @@ from refits import without_intervals
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import TargetError
-from jaxmuscle.data._as_target import as_target, kind_of_file
+from jaxmuscle.data import as_target
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.spectra._bin_law import bin_statistics, mean_error
 
@@ -358,60 +358,6 @@ def test_whatever_is_data_becomes_a_target(tmp_path):
     one = as_target(recordings[0])
     np.testing.assert_array_equal(as_target(paths[0]).proportional_power, one.proportional_power)
     assert as_target("fdi-abduction-45mvc").name == "fdi-abduction-45mvc"
-
-
-SPECTRUM = "frequency_hz,proportional_power\n" + "\n".join(
-    f"{0.390625 * k},{1 / k}" for k in range(1, 31)
-)
-SNIFFED = {
-    "spectrum": (SPECTRUM, False),
-    "misspelt spectrum": ("freq,power\n" + "1,2\n" * 100, False),
-    "points of a figure": ("\n".join(f"{0.1 * k},{1 / (1 + k)}" for k in range(120)), False),
-    "figure's data sets": ("old,,young,\nX,Y,X,Y\n" + "1,2,3,4\n" * 200, False),
-    "recording": ("time,force\n" + "\n".join(f"{k / 100},{k % 7}" for k in range(500)), True),
-    "German recording": (
-        "Zeit [s];Kraft [N]\n" + "\n".join(f"{k / 100};{k % 7}" for k in range(500)),
-        True,
-    ),
-    "numbers alone": ("\n".join(f"{k / 100},{k % 7}" for k in range(2000)), True),
-    "empty": ("", False),
-}
-
-
-@pytest.mark.parametrize("case", SNIFFED)
-def test_a_csv_is_a_recording_or_a_spectrum(case, tmp_path):
-    text, recorded = SNIFFED[case]
-    (tmp_path / "x.csv").write_text(text)
-    assert (kind_of_file(tmp_path / "x.csv") == "recording") == recorded
-
-
-TABS, BLANKS = (SPECTRUM.replace(",", sign) for sign in "\t ")
-SNIFFED_TEXT = {
-    "spectrum": (TABS, False),
-    "spectrum with blanks": (BLANKS, False),
-    "misspelt spectrum": ("freq;power\n" + "1;2\n" * 100, False),
-    "few numbers alone": (TABS.partition("\n")[2], False),
-    "recording": ("time\tforce\n" + "\n".join(f"{k / 100}\t{k % 7}" for k in range(500)), True),
-    "short recording": ("time\tforce\n0.0\t1\n0.1\t2\n", True),
-    "numbers alone": ("\n".join(f"{k % 7}" for k in range(300)), True),
-    "laboratory's header": ("Frequency:\t1000\nPower line:\toff\n" + "1\n" * 300, True),
-    "header of one cell": ("Frequency 1000 Hz\ntime\tforce\n" + "1\t2\n" * 300, True),
-    "empty": ("", True),
-}
-
-
-@pytest.mark.parametrize("suffix", [".txt", ".tsv", ".dat", ".asc"])
-@pytest.mark.parametrize("case", SNIFFED_TEXT)
-def test_a_text_is_a_recording_unless_it_states_a_spectrum(case, suffix, tmp_path):
-    text, recorded = SNIFFED_TEXT[case]
-    path = tmp_path / f"x{suffix}"
-    path.write_text(text)
-    assert (kind_of_file(path) == "recording") == recorded
-    if "spectrum" in case and "misspelt" not in case:
-        (tmp_path / "x.csv").write_text(SPECTRUM)
-        same, target = as_target(tmp_path / "x.csv"), as_target(path)
-        np.testing.assert_array_equal(target.proportional_power, same.proportional_power)
-        assert target.provenance == "user" and target.quantity == "force"
 
 
 def test_a_recording_read_as_a_spectrum_says_so(tmp_path):

@@ -57,7 +57,7 @@ def steadiness(
             from jaxmuscle._common.arguments import positive
 
             positive("--mvc", mvc)
-        if len(paths) == 1 and jm.data.is_study(paths[0]):
+        if len(paths) == 1 and jm.data.kind_of_file(paths[0]) == "study":
             if band is not None:
                 raise ValueError(
                     "--band: of a study leave it out; the band is that of the quantity"

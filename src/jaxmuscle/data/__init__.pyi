@@ -1,7 +1,7 @@
 """Public names of this wing."""
 
 from ._as_target import as_target as as_target
-from ._as_target import kind_of_file as kind_of_file
+from ._file_kinds import kind_of_file as kind_of_file
 from ._frequency_response import FrequencyResponse as FrequencyResponse
 from ._frequency_response_files import load_frequency_response as load_frequency_response
 from ._measure import Measure as Measure
@@ -16,7 +16,6 @@ from ._recording_table import Table as Table
 from ._steadiness import Steadiness as Steadiness
 from ._steadiness import steadiness as steadiness
 from ._study_table import files_of_study as files_of_study
-from ._study_table import is_study as is_study
 from ._target import Target as Target
 from ._target import load_target as load_target
 from ._target_data import TargetData as TargetData

@@ -3,24 +3,18 @@ both."""
 
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from jaxmuscle._common.errors import TargetError
 
+from ._file_kinds import are_recordings, kind_of_file
 from ._frequency_response import FrequencyResponse
-from ._frequency_response_files import is_response, load_frequency_response
+from ._frequency_response_files import load_frequency_response
 from ._perturbed import PerturbedRecording
 from ._recording import Recording
-from ._recording_files import KINDS, ROWS, is_text
 from ._target import Target, load_target
-from ._target_csv import NAMES, column_role
-from ._text_tables import TEXT, beginning, cells_of, is_number
 from ._trials import Trials, load_recordings
-from .dialects._dialects import EXPORTS
 
-Kind = Literal["recording", "spectrum", "frequency response"]
-POINTS = 500  # more than a figure of a spectrum has
 # which options say how it is read
 OPTIONS = {
     "a spectrum": ("quantity", "segments", "dataset", "axis"),
@@ -64,6 +58,11 @@ def as_target(
     options = {name: value for name, value in asked.items() if value is not None}
     if isinstance(given, str | os.PathLike):
         kind = kind_of_file(given)
+        if kind == "study":
+            raise TargetError(
+                f"{os.fspath(given)}: is the table of a study, with recordings of several people:"
+                " give it to `jaxmuscle study` (Python: jaxmuscle.run_study)"
+            )
         _check_options(options, f"a {kind}")
         if kind == "spectrum":
             return load_target(given, **options)
@@ -113,47 +112,3 @@ def _remedy(given: Any) -> str:
             " target}"
         )
     return f"{what} {usual}"
-
-
-def are_recordings(given: Sequence[Any]) -> bool:
-    """Whether all of these are paths of recordings."""
-    return all(
-        isinstance(one, str | os.PathLike) and kind_of_file(one) == "recording" for one in given
-    )
-
-
-def kind_of_file(path: str | os.PathLike[str]) -> Kind:
-    """What a `path` leads to, "recording", "spectrum" or "frequency response": by its ending,
-    a text by its header and rows. What is no file is taken for the name of a spectrum.
-
-        jm.data.kind_of_file("trial.csv")
-
-    **Arguments:** `path` of the file, which is read for that.
-    """
-    path = Path(path).expanduser()
-    ending = path.suffix.lower()
-    if ending not in TEXT or not path.is_file():
-        recorded = (ending in (*KINDS, *EXPORTS) and ending != ".csv") or is_text(path)
-        return "recording" if recorded else "spectrum"
-    rows, names, delimiter = beginning(path)
-    if rows and is_response(names):
-        return "frequency response"
-    return "recording" if _is_recorded(rows, names, delimiter, ending) else "spectrum"
-
-
-def _is_recorded(rows: list[str], names: list[str], delimiter: str | None, ending: str) -> bool:
-    """Whether a text holds samples over time, by its first rows and the cells of the first."""
-    if not rows:
-        return ending != ".csv"
-    if all(is_number(name, delimiter) for name in names):
-        return len(rows) > (POINTS if ending == ".csv" else ROWS)
-    # a column f beside a time is a force
-    spectral = {column_role(name)[0] for name in names} >= set(NAMES[:2]) or any(
-        name.startswith(("freq", "proportional", "power")) for name in names
-    )
-    second = cells_of(rows[1], delimiter) if len(rows) > 1 else []
-    if ending == ".csv":
-        figure = {cell.casefold() for cell in second} == {"x", "y"}
-        return not spectral and not figure and len(rows) > ROWS
-    # above the columns of a laboratory's text may stand a line "Frequency: 1000"
-    return not (spectral and len(names) > 1 and all(is_number(cell, delimiter) for cell in second))

@@ -2,9 +2,10 @@
 errors."""
 
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Unpack
 
 import equinox as eqx
 import numpy as np
@@ -12,12 +13,13 @@ import scipy
 from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.arguments import require
+from jaxmuscle._common.arguments import check_options, require
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.documents import Table, checked, says
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import probability
 
+from ._recording_choice import Origin
 from ._second_order import parts, second_order_shape
 from ._target_fields import frozen
 
@@ -25,6 +27,10 @@ Numbers = list[float]
 Bins = Float[np.ndarray, " bins"]
 UNSEEN = 1e-3  # how probable by chance a response may be at most, to be one
 SQUARED = "give the squared coherence, 0 to 1"
+FITTED = ("frequency_hz", "real", "imaginary", "stderr")  # columns of stiffness.csv
+HEADER = re.compile(
+    r"(frequency|freq|f|gain|phase|coherence|stderr)(?:[ _/]*[\[(]?([^\[\]()]*?)[\])]?)"
+)
 COLUMNS = ("frequency_hz", "gain_N/m", "phase_deg", "stderr_N/m", "coherence")
 
 
@@ -105,7 +111,7 @@ class FrequencyResponse(Shown, eqx.Module):
         self.name, self.source, self.notices = name, source, tuple(notices)
 
     @classmethod
-    def from_gain(  # noqa: PLR0913 (options of a public call)
+    def from_gain(
         cls,
         frequency: Any,
         gain: Any,
@@ -114,9 +120,7 @@ class FrequencyResponse(Shown, eqx.Module):
         coherence: Any = None,
         segments: Any = None,
         stderr: Any = None,
-        name: str = "response",
-        source: str = "given by the user",
-        notices: Iterable[str] = (),
+        **words: Unpack[Origin],
     ) -> "FrequencyResponse":
         """A response as figures show it: gain, phase and coherence.
 
@@ -132,7 +136,7 @@ class FrequencyResponse(Shown, eqx.Module):
         - `coherence` γ²
         - `segments`: K, one number or one for each frequency
         - `stderr` [N/m]
-        - `name`, `source`, `notices`: as in `FrequencyResponse`
+        - `words`: `name`, `source`, `notices`, as in `FrequencyResponse`
 
         **Raises:** `ValueError` without `stderr` and without (`coherence` and `segments`), and as
         `FrequencyResponse` does.
@@ -140,6 +144,7 @@ class FrequencyResponse(Shown, eqx.Module):
         **Source:** Bendat & Piersol, Random Data, 4th ed. 2010, section 9.2 (docs/perturbed.md
         derives it).
         """
+        check_options(cls.from_gain, Origin, words)
         size = np.size(frequency)
         real = "give positive numbers; a negative stiffness has the phase 180"
         gain = _column("gain", gain, size, lambda x: x > 0, real)
@@ -158,7 +163,7 @@ class FrequencyResponse(Shown, eqx.Module):
             with np.errstate(divide="ignore"):
                 stderr = gain * np.sqrt((1 - shared) / (2 * averages * shared))
         value = gain * np.exp(1j * np.radians(phase))
-        return cls(frequency, value, stderr, coherence, name=name, source=source, notices=notices)
+        return cls(frequency, value, stderr, coherence, **words)
 
     @property
     def known(self) -> "FrequencyResponse":

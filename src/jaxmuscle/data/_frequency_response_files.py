@@ -3,7 +3,6 @@ sheet."""
 
 import os
 import re
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from jaxtyping import Float
 from jaxmuscle._common.arguments import require
 from jaxmuscle._common.text import choices, printable
 
-from ._frequency_response import COLUMNS, FrequencyResponse
+from ._frequency_response import COLUMNS, FITTED, HEADER, FrequencyResponse
 from ._recording_files import read_table
 from ._recording_table import Table
 
@@ -27,10 +26,6 @@ UNITS: dict[str, dict[str, float]] = {
     "coherence": {"": 1.0},
     "stderr": STIFFNESS | ROTATION,
 }
-FITTED = ("frequency_hz", "real", "imaginary", "stderr")  # of stiffness.csv
-_HEADER = re.compile(
-    r"(frequency|freq|f|gain|phase|coherence|stderr)(?:[ _/]*[\[(]?([^\[\]()]*?)[\])]?)"
-)
 
 
 def load_frequency_response(
@@ -93,21 +88,12 @@ def load_frequency_response(
         raise ValueError(f"{table.file}: {place}") from None
 
 
-def is_response(names: Iterable[str]) -> bool:
-    """Whether columns of these names are those of a frequency response."""
-    names = {*names}
-    found = {match[1] for name in names if (match := _HEADER.fullmatch(name))}
-    return {*FITTED} <= names or (
-        {"gain", "phase"} <= found and bool(found & {"frequency", "freq", "f"})
-    )
-
-
 def _columns(table: Table) -> dict[str, tuple[str, str]]:
     """Name and unit of the column of each role."""
     found: dict[str, tuple[str, str]] = {}
     # the errors come last: without a unit they have that of the gain
     for name in sorted(table.columns, key=lambda name: name.casefold().startswith("stderr")):
-        match = _HEADER.fullmatch(name.strip().casefold())
+        match = HEADER.fullmatch(name.strip().casefold())
         if match is None:
             raise ValueError(f"unknown column {name!r}; {choices(name, COLUMNS)}")
         role = "frequency" if match[1] in ("freq", "f") else match[1]

@@ -41,12 +41,17 @@ class Measure(Shown, eqx.Module):
         interval = None if low is None else (low, high)
         return cls(math.nan if value is None else value, error, unit, error_from, interval)
 
-    def times(self, factor: float) -> "Measure":
-        """The number in another scale."""
-        low, high = self.interval or (math.nan, math.nan)
-        interval = None if self.interval is None else (factor * low, factor * high)
-        error = None if self.stderr is None else factor * self.stderr
-        return Measure(factor * self.value, error, self.unit, self.error_from, interval)
+    def times(self, factor: float, unit: str | None = None) -> "Measure":
+        """The number in another scale, and in another unit."""
+        low, high = sorted(factor * end for end in self.interval or (math.nan, math.nan))
+        error = None if self.stderr is None else abs(factor) * self.stderr
+        return Measure(
+            factor * self.value,
+            error,
+            unit or self.unit,
+            self.error_from,
+            self.interval and (low, high),
+        )
 
     def in_words(self) -> str:
         """The value, rounded to its error where it has one."""

@@ -5,7 +5,7 @@ See docs/perturbed.md for the mathematics.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import equinox as eqx
 import numpy as np
@@ -13,7 +13,7 @@ import scipy
 from jaxtyping import Bool, Complex, Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.arguments import is_real, require
+from jaxmuscle._common.arguments import check_options, is_real, require
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.names import name_of_all
 from jaxmuscle.spectra._cross_spectrum import Response, response_of
@@ -22,7 +22,8 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 from ._frequency_response import FrequencyResponse
 from ._measure import Measure, normal_interval
 from ._recording import Recording, pooled_target, recorded_settings
-from ._recording_quality import Baseline
+from ._recording_choice import About
+from ._recording_quality import Baseline, signal_of
 from ._second_order import SecondOrder, lateness, lengthens, second_order_fit
 from ._target import Target
 from ._units import scale_to_si
@@ -74,6 +75,13 @@ Ordinates = Complex[np.ndarray, " frequencies"]
 Stiffness = Callable[[Frequencies], Ordinates]
 Motion = Float[np.ndarray, "3 times"]
 Reply = Float[np.ndarray, " steps"]
+
+
+class _Options(About, total=False):
+    """Those of `Recording` that two channels have, too."""
+
+    baseline: Baseline
+    detrend: bool
 
 
 class PerturbedRecording(Shown, eqx.Module):
@@ -133,7 +141,7 @@ class PerturbedRecording(Shown, eqx.Module):
         self.notices = tuple(dict.fromkeys((*notices, *force.notices, *moved)))
 
     @classmethod
-    def from_array(  # noqa: PLR0913 (options of a public call)
+    def from_array(
         cls,
         force: Any,
         displacement: Any,
@@ -144,14 +152,7 @@ class PerturbedRecording(Shown, eqx.Module):
         lever_arm: float | int | None = None,
         positive: str | None = None,
         delay: float | int = 0.0,
-        name: str = "recording",
-        source: str = "given by the user",
-        start: float | int = 0.0,
-        window: Sequence[float | int] | None = None,
-        notices: Iterable[str] = (),
-        others: Iterable["PerturbedRecording"] = (),
-        baseline: Baseline = None,
-        detrend: bool = False,
+        **options: Unpack[_Options],
     ) -> "PerturbedRecording":
         """A recording from two arrays of one length; torque and angle are converted with the lever
         arm.
@@ -168,11 +169,12 @@ class PerturbedRecording(Shown, eqx.Module):
           with the other sign, that of the displacement is turned, and a notice says so.
         - `delay` [s]: by which the force channel lags behind the displacement channel; the
           displacement is shifted by it.
-        - `name`, `source`, `start`, `window`, `notices`, `others`: as in `Recording`; `baseline`,
-          `detrend` too, of the force.
+        - `options`: `name`, `source`, `start`, `window`, `notices`, `others`, as in `Recording`;
+          `baseline`, `detrend` too, of the force.
 
         **Raises:** `ValueError` naming the argument, its value and the remedy.
         """
+        check_options(cls.from_array, _Options, options)
         known = positive in (None, "lengthening", "shortening")
         require(known, "positive", positive, "choose lengthening or shortening")
         scale, turned = scale_to_si(units, "units", "force", lever_arm)
@@ -181,7 +183,7 @@ class PerturbedRecording(Shown, eqx.Module):
         )
         remedy = f"leave it out: {units} and {displacement_units} need none"
         require(lever_arm is None or turned or swung, "lever_arm", lever_arm, remedy)
-        pull, moved = _signal("force", force), _signal("displacement", displacement)
+        pull, moved = signal_of("force", force), signal_of("displacement", displacement)
         _check_length(pull.size, moved.size)
         if np.isfinite(moved).all() and _is_constant(moved):
             raise ValueError(
@@ -189,10 +191,10 @@ class PerturbedRecording(Shown, eqx.Module):
                 " muscle. Take the force alone, as a hold, or choose another column"
             )
         pull, moved, begin, said = _shifted(scale * pull, reach * moved, float(rate), delay)
-        start = float(start) + begin
-        words: dict[str, Any] = {"name": name, "source": source, "start": start, "window": window}
-        own = {"unit": "N", "baseline": baseline, "detrend": detrend}
-        pulled = _recording("force", pull, rate, words | own)
+        notices, others = options.pop("notices", ()), options.pop("others", ())
+        options["start"] = float(options.get("start", 0.0)) + begin
+        words = {key: value for key, value in options.items() if key in About.__optional_keys__}
+        pulled = _recording("force", pull, rate, {**options, "unit": "N"})
         given = _recording("displacement", moved, rate, words | {"unit": "m"})
         turn, more = _sign(pulled, given, positive)
         if np.mean(pulled.whole) < 0:
@@ -382,15 +384,6 @@ class PerturbedRecording(Shown, eqx.Module):
         ]
         size = f"{force.whole.size} samples at {self.rate:g} Hz"
         return facts(f"{self.name}: force [N] and lengthening [m], {size}", known)
-
-
-def _signal(name: str, values: Any) -> Times:
-    try:
-        signal = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: give real numbers, one for each time") from None
-    require(signal.ndim == 1, f"{name} shape", signal.shape, "give one signal")
-    return signal
 
 
 def _check_length(force: int, moved: int) -> None:

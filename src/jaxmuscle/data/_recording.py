@@ -3,7 +3,7 @@ target it gives."""
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any, Unpack, get_args
 
@@ -22,7 +22,7 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
 from ._measured import AS_RECORDED, FLOATING, MOTIONS, RECORDED, measure_signals
-from ._recording_choice import Reading, ReadingOptions, recording_of
+from ._recording_choice import About, Reading, ReadingOptions, recording_of
 from ._recording_outliers import OUTLIERS, OUTSIDE, Burst, find_bursts
 from ._recording_quality import (
     AT_REST,
@@ -95,7 +95,7 @@ class Recording(Shown, eqx.Module):
     recorded_at: float = eqx.field(static=True)
     others: tuple["Recording", ...]
 
-    def __init__(  # noqa: PLR0913 (all that is known of a recording)
+    def __init__(
         self,
         samples: Any,
         rate: float | int,
@@ -104,15 +104,13 @@ class Recording(Shown, eqx.Module):
         quantity: str | None = None,
         baseline: Baseline = None,
         detrend: bool = False,
-        name: str = "recording",
-        source: str = "given by the user",
-        start: float | int = 0.0,
-        window: Sequence[float | int] | None = None,
-        notices: Iterable[str] = (),
         recorded_at: float | int | None = None,
-        others: Iterable["Recording"] = (),
+        **about: Unpack[About],
     ):
-        self.rate, self.start, self.name, self.source = _rate(rate), float(start), name, source
+        check_options(Recording, About, about)
+        self.name = about.get("name", "recording")
+        self.source = about.get("source", "given by the user")
+        self.rate, self.start = _rate(rate), float(about.get("start", 0.0))
         self.recorded_at = self.rate if recorded_at is None else _rate(recorded_at)
         spelled = known_unit(unit)
         require(spelled is not None, "unit", unit, choices(unit, UNITS))
@@ -124,7 +122,7 @@ class Recording(Shown, eqx.Module):
         remedy = f"the unit {unit} is that of another quantity ({self.quantity}); give `units`"
         require(quantity in (None, self.quantity), "quantity", quantity, remedy)
         given = checked(samples, self.rate, self.start)
-        self.others, notices = tuple(others), tuple(notices)
+        self.others, notices = tuple(about.get("others", ())), tuple(about.get("notices", ()))
         if baseline is None and self.quantity in MOTIONS:
             baseline = "none"
         self.whole, said = without_rest(given, self.rate, self.start, self.unit, baseline)
@@ -134,6 +132,7 @@ class Recording(Shown, eqx.Module):
         if self.rate < RECORDED.rate:
             own.append(f"recorded at {self.rate:g} Hz: holds nothing above {self.rate / 2:g} Hz")
         self.notices = tuple(dict.fromkeys((*notices, *own)))
+        window = about.get("window")
         self.window = None if window is None else self._checked(window)
 
     @classmethod
@@ -183,22 +182,9 @@ class Recording(Shown, eqx.Module):
 
     def _with(self, **changed: Any) -> "Recording":
         """The recording with other arguments; its level at rest is subtracted already."""
-        kept = (
-            *(
-                "rate",
-                "unit",
-                "quantity",
-                "detrend",
-                "name",
-                "source",
-                "start",
-                "window",
-                "notices",
-            ),
-            "recorded_at",
-        )
-        fields: dict[str, Any] = {"samples": self.whole, "baseline": "none"}
-        return Recording(**fields | {key: getattr(self, key) for key in kept} | changed)
+        # parts beyond a pause are parts of the file, not of what is made of one of them
+        kept = {key: value for key, value in vars(self).items() if key not in ("whole", "others")}
+        return Recording(**{"samples": self.whole, "baseline": "none"} | kept | changed)
 
     @property
     def stop(self) -> float:

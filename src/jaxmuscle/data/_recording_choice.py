@@ -3,7 +3,7 @@
 import contextlib
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict
 
@@ -60,6 +60,22 @@ class _Choice(NamedTuple):
     name: str
     columns: list[str]
     notice: str = ""
+
+
+class Origin(TypedDict, total=False):
+    """How reports call what was measured: its name, where it comes from, what was done to it."""
+
+    name: str
+    source: str
+    notices: Iterable[str]
+
+
+class About(Origin, total=False):
+    """What is known of a recording besides its samples, see `Recording`."""
+
+    start: float | int
+    window: Sequence[float | int] | None
+    others: Iterable[Any]
 
 
 class ReadingOptions(TypedDict, total=False):
@@ -214,10 +230,11 @@ def perturbed_of(
             " insertion, the force alone, as `column`"
         )
     source = f"{Path(table.file).name}, columns {force} and {displacement}, {found.rate:.6g} Hz"
-    known = {"units": units, "displacement_units": moved, "name": table.name, **options}
+    options |= {"units": units, "displacement_units": moved, "lever_arm": reading.lever_arm}
 
     def make_one(whole: np.ndarray, rate: float, **more: Any) -> Any:
-        return make(*whole.T, rate, source=printable(source), **known, **more)
+        named = {"name": table.name, "source": printable(source)}
+        return make(*whole.T, rate, **named, **options, **more)
 
     return _make_parts(make_one, found._replace(notices=notices), signal, reading, table.file)
 

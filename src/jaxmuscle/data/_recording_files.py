@@ -8,27 +8,20 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Unpack, overload
 
-from jaxmuscle._common.arguments import require
-from jaxmuscle._common.files import expanded
+from jaxmuscle._common.arguments import check_options, require
 from jaxmuscle._common.inputs import BEYOND, looked_at, most, read_bytes
 from jaxmuscle._common.text import choices
 
 from ._apart import read_apart
+from ._file_kinds import BOOKS, KINDS, LOOK, ROWS, look_at
 from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_choice import Reading, ReadingOptions, perturbed_of, recording_of, signals
 from ._recording_csv import read_csv
-from ._recording_quality import Baseline
 from ._recording_table import Table, channels_table, find
 from ._recording_time import clock
-from ._text_tables import LOOK, TEXT, holds_text
+from ._text_tables import holds_text
 from .dialects._dialects import EXPORTS
-
-BOOKS = (".xlsx", ".xlsm")
-BINARY = (".mat", ".npy", ".npz", ".c3d", ".edf", ".bdf", ".tdms", ".acq", ".smr")
-KINDS = (*TEXT, ".xlsx", *BINARY, ".xlsm", ".gz")
-TARGETS = (".toml", ".json")
-ROWS = 90  # that the shortest recording has
 
 
 @overload
@@ -39,28 +32,17 @@ def load_recording(
 def load_recording(
     path: str | os.PathLike[str] | Table, *, force: str | int, **options: Any
 ) -> PerturbedRecording: ...
-def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsistentOverload]
+def load_recording(  # pyright: ignore[reportInconsistentOverload]
     path: str | os.PathLike[str] | Table,
     *,
-    column: str | int | None = None,
     force: str | int | None = None,
     displacement: str | int | None = None,
-    rate: float | int | None = None,
-    units: str | None = None,
-    axis: str | None = None,
-    reference: str | int | None = None,
-    time: str | int | None = None,
-    skip_rows: int = 0,
-    sheet: str | int | None = None,
-    max_gap: float | int = 0.2,
-    outliers: str = "keep",
     displacement_units: str | None = None,
-    lever_arm: float | int | None = None,
     positive: str | None = None,
     delay: float | int = 0.0,
-    quantity: str | None = None,
-    baseline: Baseline = None,
-    detrend: bool = False,
+    skip_rows: int = 0,
+    sheet: str | int | None = None,
+    **options: Unpack[ReadingOptions],
 ) -> Recording | PerturbedRecording:
     """Load a recording from text, Excel, MATLAB, NumPy, C3D, EDF, TDMS, AcqKnowledge or Spike2
     files.
@@ -115,36 +97,22 @@ def load_recording(  # noqa: PLR0913 (public options)  # pyright: ignore[reportI
     **Raises:** `ValueError` naming file, line or argument, and the remedy; `ImportError` that says
     what to install.
     """
-    reading = Reading(
-        column,
-        rate,
-        units,
-        axis,
-        reference,
-        time,
-        max_gap,
-        lever_arm,
-        outliers,
-        quantity,
-        baseline,
-        detrend,
-    )
-    options = {"displacement_units": displacement_units, "positive": positive, "delay": delay}
+    check_options(load_recording, ReadingOptions, options)
+    reading = Reading(**options)
+    both = {"displacement_units": displacement_units, "positive": positive, "delay": delay}
     if force is None or displacement is None:
         remedy = "belongs to recordings of two channels; give `force` and `displacement`"
-        strange = {"force": force, "displacement": displacement, **options, "delay": delay or None}
+        strange = {"force": force, "displacement": displacement, **both, "delay": delay or None}
     else:
         remedy = "leave it out: `force` and `displacement` name the columns"
-        strange = {"column": column, "axis": axis, "reference": reference, "quantity": quantity}
+        strange = {name: options.get(name) for name in ("column", "axis", "reference", "quantity")}
     for name, value in strange.items():
         require(value is None, name, value, remedy)
     table = read_table(path, skip_rows, sheet)
     if force is None or displacement is None:
         return recording_of(Recording, table, reading)
     columns = {"force": force, "displacement": displacement}
-    return perturbed_of(
-        PerturbedRecording.from_array, table, reading, columns, lever_arm=lever_arm, **options
-    )
+    return perturbed_of(PerturbedRecording.from_array, table, reading, columns, **both)
 
 
 def load_columns(
@@ -218,12 +186,10 @@ def read_tables(
     if isinstance(path, Table):
         return [path]
     require(isinstance(path, str | os.PathLike), "path", path, "give the path of a recording")
-    file = expanded(path)
-    kind = file.suffix.lower()
+    file, kind, text, _ = look_at(path)
     whole = isinstance(skip_rows, int) and skip_rows >= 0
     require(whole, "skip_rows", skip_rows, "give a number of lines")
     instead = f"a recording ({', '.join(KINDS)})"
-    text = kind in TEXT or is_text(file)
     book = kind in BOOKS and not text
     rows = text or book or kind == ".gz"
     require(skip_rows == 0 or rows, "skip_rows", skip_rows, f"leave it out: {kind} has no lines")
@@ -243,16 +209,6 @@ def read_tables(
     if isinstance(found, dict):
         return _sheets(file, found, skip_rows, sheet)
     return [channels_table(str(file), found, named=kind != ".npy")]
-
-
-def is_text(file: Path) -> bool:
-    """Whether a file is a text with rows of numbers, though its ending does not say so."""
-    kind = file.suffix.lower()
-    if (kind in (*TARGETS, *KINDS) and kind != ".mat") or not file.is_file():
-        return False
-    with contextlib.suppress(OSError), file.open("rb") as stream:
-        return holds_text(stream.read(LOOK))
-    return False
 
 
 def _unpacked(file: Path, instead: str) -> bytes:

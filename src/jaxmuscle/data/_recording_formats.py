@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ._recording_channels import Channel, TooLarge, numbers
+from .dialects._dialect import upright
 from .dialects._dialects import DIALECTS
 from .dialects._variables import stated
 
@@ -146,12 +147,11 @@ def _channels(content: Mapping[str, Any], beside: Sequence[Channel] = ()) -> lis
     for name, array in variables.items():
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf" or array.ndim > 2:
             continue
-        upright = array.reshape(-1, 1) if array.ndim < 2 else array
-        upright = upright.T if upright.shape[0] < upright.shape[1] else upright
-        if upright.shape[0] >= 2 and upright.shape[1]:
-            labels = [str(i) if not name else f"{name}:{i}" for i in range(upright.shape[1])]
+        columns = upright(array)
+        if columns.shape[0] >= 2 and columns.shape[1]:
+            labels = [f"{name}:{i}" if name else str(i) for i in range(columns.shape[1])]
             labels = [name] if len(labels) == 1 and name else labels
-            found[name] = [Channel(*each) for each in zip(labels, upright.T, strict=True)]
+            found[name] = [Channel(*each) for each in zip(labels, columns.T, strict=True)]
     if not found and not beside:
         raise ValueError("holds no numbers in one or two dimensions")
     return stated(variables, found)

@@ -354,15 +354,21 @@ def _span(baseline: Any, start: float, stop: float) -> tuple[float, float]:
     return a, b
 
 
+def signal_of(name: str, values: Any) -> Float[np.ndarray, " all"]:
+    """The numbers of an argument as a copy. **Raises:** `ValueError` if they are no signal."""
+    try:
+        x = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: give real numbers, one for each time") from None
+    remedy = "give one signal of 2 samples or more"
+    require(x.ndim == 1 and x.size >= 2, f"{name} shape", x.shape, remedy)
+    return x
+
+
 def checked(samples: Any, rate: float, start: float) -> Float[np.ndarray, " all"]:
     """The samples as a copy that cannot be changed. **Raises:** `ValueError` if they are no
     signal."""
-    try:
-        x = np.array(samples, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError("samples: give real numbers, one for each time") from None
-    remedy = "give one signal of 2 samples or more"
-    require(x.ndim == 1 and x.size >= 2, "samples shape", x.shape, remedy)
+    x = signal_of("samples", samples)
     # what is larger is no measurement either, and its square is none
     wrong = np.flatnonzero(~(np.abs(x) < 1e100))
     if wrong.size:

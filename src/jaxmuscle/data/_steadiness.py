@@ -251,10 +251,7 @@ def steadiness(
 def _with_level(measures: dict[str, Measure], mvc: float | int) -> dict[str, Measure]:
     """The measures with the mean over that of a maximal contraction behind it."""
     (name, mean), *others = measures.items()
-    scale = math.copysign(1 / mvc, mean.value)
-    low, high = sorted(scale * end for end in mean.interval or (math.nan, math.nan))
-    error = None if mean.stderr is None else mean.stderr / mvc
-    level = Measure(scale * mean.value, error, "1", mean.error_from, mean.interval and (low, high))
+    level = mean.times(math.copysign(1 / mvc, mean.value), "1")
     return dict([(name, mean), (LEVEL_NAME, level), *others])
 
 

@@ -18,16 +18,15 @@ from jaxmuscle._common.inputs import looked_at, read_text
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import NAMED
 
+from ._file_kinds import STUDY
 from ._recording_choice import Reading
 from ._recording_files import load_recording
 from ._target import Target
-from ._text_tables import SIGNS, cells_of, lines_of, number_in
+from ._text_tables import cells_of, delimiter_in, lines_of, number_in
 from ._trials import Trials
 
-NEEDED = ("file", "person")
-LONGEST_HEAD = 4096  # letters of the first line that are looked at
 TABLES = "the table of a study (.csv, .tsv, .txt or .toml)"
-LABELS = (*NEEDED, "group", "condition", "trial")
+LABELS = (*STUDY, "group", "condition", "trial")
 # of `load_recording`, of `Trials.target`
 FILES, SPECTRA = (*Reading._fields, "skip_rows", "sheet"), ("spectrum", "mvc")
 EDGES = ("window_start", "window_stop")
@@ -302,26 +301,6 @@ def files_of_study(path: str | os.PathLike[str]) -> list[Path]:
     return [*found.files, *(row.file for row in found.rows)]
 
 
-def is_study(path: str | os.PathLike[str]) -> bool:
-    """Whether the file at `path` is the table of a study, as `run_study` reads it: a .toml that
-    names one or has `[[recordings]]`, or a text table with the columns file and person.
-
-        jm.data.is_study("study.csv")
-
-    It is read for that.
-    """
-    path = expanded(path)
-    if path.suffix.lower() == ".toml":
-        stated = parsed(read_text(path, instead=TABLES), str(path), "TOML")
-        return "table" in stated or "recordings" in stated
-    if path.suffix.lower() not in (".csv", ".tsv", ".txt") or not path.is_file():
-        return False
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        head = file.readline(LONGEST_HEAD)
-    delimiter = next((sign for sign in SIGNS if sign in head), ",")
-    return set(NEEDED) <= {name.strip().casefold() for name in cells_of(head, delimiter)}
-
-
 def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cell]:
     """The trials of every person in every condition made one target, each in its own or the
     `defaults`' window, or steady.
@@ -379,14 +358,16 @@ def _named(place: str) -> Iterator[None]:
 def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
     """Place and cells of every row of a text table; empty cells left out."""
     lines = [line for line in lines_of(read_text(path, instead=TABLES)) if line.body.strip()]
-    delimiter = next((sign for sign in SIGNS if lines and sign in lines[0].body), ",")
+    if not lines:
+        raise ValueError(f"{path}: holds no data, only comments")
     (head, *body), found = lines, []
+    delimiter = delimiter_in(head.body) or ","
     names, place = [n.casefold() for n in cells_of(head.body, delimiter)], f"{path}: {head.place}"
     for name in names:
         _check_column(name, place)
         if names.count(name) > 1:
             raise ValueError(f"{place}: two columns are called {name}: leave one out")
-    for name in NEEDED:
+    for name in STUDY:
         if name not in names:
             raise ValueError(
                 f"{place}: no column {name}; the header needs file and person, and may"
@@ -465,7 +446,7 @@ def _row(place: str, given: dict[str, Any], folder: Path) -> Row:
         _check_column(name, place)
     filled = {name: value for name, value in given.items() if value is not None}
     texts = {name: str(filled.get(name, "")).strip() for name in LABELS}
-    for name in NEEDED:
+    for name in STUDY:
         if not texts[name]:
             raise ValueError(f"{place}: no {name}; every recording needs a file and a person")
     window = tuple(given.get(name) for name in EDGES)

@@ -4,7 +4,7 @@ import dataclasses
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypedDict, Unpack, get_args
 
 import equinox as eqx
 import numpy as np
@@ -12,6 +12,7 @@ import tomli_w
 from jaxtyping import Float, Int
 
 from jaxmuscle import plot
+from jaxmuscle._common.arguments import check_options
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import write_text
@@ -49,6 +50,29 @@ class Samples:
     """The samples of every trial. All are equal: what a target says is its spectrum."""
 
     each: tuple[Float[np.ndarray, " _"], ...] = dataclasses.field(compare=False, repr=False)
+
+
+class Stated(TypedDict, total=False):
+    """What a target may state besides its powers, see `Target`."""
+
+    quantity: str
+    provenance: str
+    source: str
+    sigma: Any
+    segments: int | Sequence[int] | None
+    coefficient_of_variation: float | Sequence[float] | None
+    mvc_fraction: float | None
+    mean: float | Sequence[float] | None
+    unit: str | None
+    recorded_at: float | int | None
+    trial_power: Any
+    dispersion: float | Sequence[float] | None
+    reason: str | None
+    stiffness: FrequencyResponse | Mapping[str, Any] | None
+    measured: Mapping[str, Any] | tuple[tuple[Any, ...], ...] | None
+
+
+UNSTATED: Stated = {"quantity": "force", "provenance": "user", "source": "given by the user"}
 
 
 class Target(Shown, eqx.Module):
@@ -118,56 +142,29 @@ class Target(Shown, eqx.Module):
     samples: Samples = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(  # noqa: PLR0913 (options of a public call)
+    def __init__(
         self,
         name: str,
         proportional_power: Any,
         *,
         bins: Any = None,
-        quantity: str = "force",
-        provenance: str = "user",
-        source: str = "given by the user",
-        sigma: Any = None,
-        segments: int | Sequence[int] | None = None,
-        coefficient_of_variation: float | Sequence[float] | None = None,
-        mvc_fraction: float | None = None,
-        mean: float | Sequence[float] | None = None,
-        unit: str | None = None,
-        recorded_at: float | int | None = None,
-        trial_power: Any = None,
-        dispersion: float | Sequence[float] | None = None,
-        reason: str | None = None,
-        stiffness: FrequencyResponse | Mapping[str, Any] | None = None,
-        measured: Mapping[str, Measure | Mapping[str, Any]]
-        | tuple[tuple[Any, ...], ...]
-        | None = None,
         settings: SpectrumSettings | None = None,
         signals: Iterable[np.ndarray] = (),
         notices: Iterable[str] = (),
+        **stated: Unpack[Stated],
     ):
+        check_options(Target, Stated, stated)
         settings = SpectrumSettings() if settings is None else settings
-        stated = {
-            "name": name,
-            "quantity": quantity,
-            "provenance": provenance,
-            "source": source,
-            "segments": segments,
-            "coefficient_of_variation": coefficient_of_variation,
-            "mvc_fraction": mvc_fraction,
-            "mean": mean,
-            "unit": unit,
-            "recorded_at": recorded_at,
-            "reason": reason,
-            "dispersion": dispersion,
-        }
-        for field, value in stated.items():
-            setattr(self, field, check.metadata(field, value))
-        if self.quantity == "acceleration" and coefficient_of_variation is not None:
+        said = UNSTATED | stated | {"name": name}
+        for field in check.ALONE:
+            setattr(self, field, check.metadata(field, said.get(field)))
+        if self.quantity == "acceleration" and self.coefficient_of_variation is not None:
             raise TargetError(
                 "coefficient_of_variation: the mean of an acceleration is zero; leave it out"
             )
-        self.measures = check.metadata("measured", measured)
+        self.measures = check.metadata("measured", stated.get("measured"))
         self.settings, self.samples = settings, Samples(tuple(signals))
+        stiffness, sigma = stated.get("stiffness"), stated.get("sigma")
         if isinstance(stiffness, Mapping):
             stiffness = FrequencyResponse.from_table(stiffness)
         if not isinstance(stiffness, FrequencyResponse | None):
@@ -193,8 +190,8 @@ class Target(Shown, eqx.Module):
         self.proportional_power = check.frozen(power / over)
         self.sigma = None if deviation is None else check.frozen(deviation / over)
         self.trial_power = None
-        if trial_power is not None:
-            self.trial_power = check.trial_powers(trial_power, self.segments, power)
+        if (rows := stated.get("trial_power")) is not None:
+            self.trial_power = check.trial_powers(rows, self.segments, power)
             self.dispersion = dispersion_of(
                 self.trial_power, self.segments or (), settings, self.bins
             )

@@ -11,7 +11,7 @@ from jaxmuscle._common.text import choices, printable
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._target_fields import Columns, Raw, Rows, check_columns
-from ._text_tables import SIGNS, cells_of, is_number, lines_of, number_in
+from ._text_tables import cells_of, delimiter_in, is_number, lines_of, number_in
 
 NAMES: tuple[str, ...] = ("frequency_hz", "proportional_power", "sigma")
 EXPECTED = f"{NAMES[0]},{NAMES[1]}[,sigma]"
@@ -44,7 +44,7 @@ def read_csv(text: str, file: str, dataset: str | None, axis: str) -> Raw:
     comment = " ".join(line.note.strip() for line in lines if line.note and line.note.strip())
     if not rows:
         raise TargetError(f"{file}: holds no data; expected lines of {NAMES[0]},{NAMES[1]}")
-    delimiter = next((sign for sign in "\t;" if len(rows) > 1 and sign in rows[1][1]), ",")
+    delimiter = delimiter_in(rows[min(1, len(rows) - 1)][1]) or ","
     cells = [(place, cells_of(body, delimiter)) for place, body in rows]
     if len(rows) > 1 and LABELS in _pairs(cells[1][1]):
         return _of_dataset(cells, delimiter, file, dataset, axis)
@@ -157,7 +157,7 @@ def _delimiter(place: str, body: str, file: str) -> str | None:
         raise TargetError(
             f"{file}, {place}: holds tabs and semicolons; use one of them between the columns"
         )
-    found = next((sign for sign in SIGNS if sign in body.strip()), None)
+    found = delimiter_in(body.strip())
     if found is None and len(body.split()) < 2:
         raise TargetError(
             f"{file}, {place}: one column; separate frequency and power by comma, semicolon, tab or"

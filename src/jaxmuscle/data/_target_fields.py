@@ -317,6 +317,8 @@ FIELDS = {
         "their defaults",
     ),
 }
+# which are checked alone and kept as they are stated
+ALONE = [key for key, field in FIELDS.items() if field.check and key not in ("notices", "measured")]
 _FORMAT = Field(_format, "Version of the format", "1", "1")
 _KEYS: Any = [
     (

@@ -3,13 +3,11 @@ commas."""
 
 import csv
 import re
-from pathlib import Path
 from typing import NamedTuple
 
 SIGNS = ("\t", ";", ",")
 TEXT = (".csv", ".tsv", ".txt", ".dat", ".asc")  # files that hold one
 LOOK_AT = 100  # cells of a line
-LOOK = 1 << 16  # bytes of a file that say what it is
 
 
 class Line(NamedTuple):
@@ -35,6 +33,11 @@ def lines_of(text: str) -> list[Line]:
         Line(number, body, note if sign else None)
         for number, (body, sign, note) in enumerate(parts, 1)
     ]
+
+
+def delimiter_in(body: str, usual: str | None = None) -> str | None:
+    """The sign between the cells of a line: tab, semicolon or comma, the first that is there."""
+    return next((sign for sign in SIGNS if sign in body), usual)
 
 
 def cells_of(body: str, delimiter: str | None) -> list[str]:
@@ -90,17 +93,3 @@ def _is_row(line: str) -> bool:
     cells = re.split(r"[\t;, ]+", line.strip('\t;, "'))
     numbers = sum(is_number(cell, ",") for cell in cells[:LOOK_AT])
     return numbers > 0 and 2 * numbers >= len(cells[:LOOK_AT])
-
-
-def beginning(path: Path) -> tuple[list[str], list[str], str | None]:
-    """The first lines of a file that are not empty, the cells of the first in small letters, and
-    the delimiter."""
-    with path.open("rb") as file:
-        text = file.read(LOOK).decode("utf-8", errors="replace")
-    rows = [line.body for line in lines_of(text) if line.body.strip()]
-    delimiter = next((sign for sign in SIGNS if rows and sign in rows[0]), None)
-    return (
-        rows,
-        [cell.casefold() for cell in cells_of(rows[0], delimiter)] if rows else [],
-        delimiter,
-    )

@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxmuscle._common.arguments import require
 
-from ._as_target import are_recordings
+from ._file_kinds import are_recordings
 from ._perturbed import PerturbedRecording
 from ._recording_choice import (
     FORCE,

@@ -6,7 +6,7 @@ import numpy as np
 
 from .._recording_channels import Channel
 from .._units import seconds
-from ._dialect import Above, Content, Dialect, Head, per_second, rate_of, texts
+from ._dialect import Above, Content, Dialect, Head, columns_of, per_second, rate_of, texts
 
 _PER_SAMPLE = re.compile(r"\s*([\d.,]+(?:e-?\d+)?)\s*([a-zµ]+)/sample", re.IGNORECASE)
 
@@ -56,12 +56,7 @@ def _mat(content: Content) -> tuple[list[Channel], list[str]] | None:
         return None
     scale = "".join(texts(content.get("isi_units", "ms"))[:1])
     rate = per_second(content["isi"], scale)
-    found = [
-        Channel(
-            label or f"channel {i}", column, rate, unit, "data" if len(labels) == 1 else f"data:{i}"
-        )
-        for i, (label, unit, column) in enumerate(zip(labels, units, data.T, strict=True))
-    ]
+    found = columns_of("data", [*data.T], rate, labels, units)
     return found, ["data", "labels", "units", "isi", "isi_units", "start_sample"]
 
 

@@ -2,7 +2,7 @@
 
 import re
 
-from ._dialect import Above, Block, Dialect, Head
+from ._dialect import Above, Block, Dialect, Head, below_groups, first_columns
 
 RATE = re.compile(r"([\d.,]+)\s*\(?Hz\)?", re.IGNORECASE)
 _SERIAL = re.compile(r" *\(\d+\)$")
@@ -19,8 +19,7 @@ def _blocks(data: bytes) -> list[Block] | None:
         return None
     sign = next(sign for sign in (b"\t", b";", b",") if sign in names[0] or sign == b",")
     width = len(names[0].rstrip(sign).split(sign))
-    row = b"(?m)^((?:[^S\n]*S){%d}[^S\n]*)S[^\n]*$" % (width - 1)
-    return [Block(re.sub(row.replace(b"S", re.escape(sign)), rb"\1", data), 0, _head)]
+    return [Block(first_columns(data, sign, width), 0, _head)]
 
 
 def _head(above: Above) -> Head | None:
@@ -31,12 +30,9 @@ def _head(above: Above) -> Head | None:
     if not at:
         return None
     names = rows[at - 1]
-    sensors = next((row for row in rows[:at] if _SERIAL.search(row[0])), [])
-    sensor, whole = "", []
-    for j, name in enumerate(names):
-        sensor = (_SERIAL.sub("", sensors[j]) if sensors else "") or sensor
-        twice = bool(name) and names.count(name) > 1
-        whole.append(f"{sensor} {name}".strip() if twice else name)
+    sensors = next((row for row in rows[:at] if _SERIAL.search(row[0])), [""] * len(names))
+    sensors = [_SERIAL.sub("", sensor) for sensor in sensors]
+    whole = below_groups(names, sensors, lambda j: bool(names[j]) and names.count(names[j]) > 1)
     rates = rates_in(rows[at]) or []
     first = above.cells[-1]
     return Head(whole, rates=rates, counts=int(bool(first) and not first[0]))

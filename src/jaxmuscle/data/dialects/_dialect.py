@@ -1,6 +1,7 @@
 """What a dialect is, and what the readers of several need."""
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -92,6 +93,31 @@ def frequency(cell: str) -> float | None:
     return found if 0 < found < math.inf else None
 
 
+def first_columns(data: bytes, sign: bytes, count: int) -> bytes:
+    """The rows of a text cut behind so many columns: what stands beside these few rows have."""
+    row = b"(?m)^((?:[^S\n]*S){%d}[^S\n]*)S[^\n]*$" % (count - 1)
+    return re.sub(row.replace(b"S", re.escape(sign)), rb"\1", data)
+
+
+def below_groups(
+    names: Sequence[str], groups: Sequence[str], joined: Callable[[int], bool]
+) -> list[str]:
+    """Names of columns behind the device or point whose name stands above the first of its columns,
+    of those columns for which they are to be `joined`."""
+    group, found = "", []
+    for j, (name, above) in enumerate(zip(names, groups, strict=True)):
+        group = above or group
+        found.append(f"{group} {name}".strip() if joined(j) else name)
+    return found
+
+
+def upright(values: object) -> np.ndarray:
+    """An array with its samples along the first of two dimensions, which is the longer one."""
+    array = np.asarray(values)
+    array = array.reshape(-1, 1) if array.ndim < 2 else array
+    return array.T if array.shape[0] < array.shape[1] else array
+
+
 def triples(names: Iterable[str]) -> list[str]:
     """The columns of points."""
     return [f"{name} {axis}" for name in names for axis in "XYZ"]
@@ -106,6 +132,19 @@ def texts(value: Any) -> list[str]:
     cells = list(value.reshape(-1) if isinstance(value, np.ndarray) else value or ())
     cells = ["" if np.size(cell) == 0 else cell for cell in cells]
     return [str(cell).strip() for cell in cells] if all(isinstance(c, str) for c in cells) else []
+
+
+def columns_of(
+    variable: str,
+    columns: Sequence[np.ndarray],
+    rate: float | None,
+    names: Sequence[str],
+    units: Sequence[str],
+) -> list[Channel]:
+    """The channels in the columns of a variable of a .mat, which are also found as `Data:3`."""
+    aliases = [f"{variable}:{i}" for i in range(len(columns))] if len(columns) > 1 else [variable]
+    rows = zip(names, columns, units, aliases, strict=True)
+    return [Channel(name, column, rate, unit, alias) for name, column, unit, alias in rows]
 
 
 def number(value: Any) -> float | None:

@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from .._recording_channels import Channel
-from ._dialect import Above, Content, Dialect, Head, number, rate_of, texts
+from ._dialect import Above, Content, Dialect, Head, columns_of, number, rate_of, texts
 
 
 def _head(above: Above) -> Head | None:
@@ -84,13 +84,11 @@ def _tables(content: Content) -> tuple[list[Channel], list[str]]:
         ticks = np.ravel(own["ticktimes"]) if np.size(own["ticktimes"]) > 1 else np.zeros(2)
         span = float(ticks[-1] - ticks[0])
         rate = number(own["samplerate"]) or ((ticks.size - 1) / span if span > 0 else None)
-        titles, units = texts(own["titles"]), texts(own["units"])
-        for i, samples in enumerate(rows):
-            name = titles[i] if len(titles) == len(rows) and titles[i] else f"channel {i + 1}"
-            unit = units[i] if len(units) == len(rows) else ""
-            name = name if len(numbers) == 1 else f"{name}, block {block}"
-            alias = f"data_block{block}" + f":{i}" * (len(rows) > 1)
-            found.append(Channel(name, samples, rate, unit, alias))
+        known = [texts(own[key]) for key in ("titles", "units")]
+        titles, units = (each if len(each) == len(rows) else [""] * len(rows) for each in known)
+        suffix = f", block {block}" if len(numbers) > 1 else ""
+        names = [f"{title or f'channel {i}'}{suffix}" for i, title in enumerate(titles, 1)]
+        found += columns_of(f"data_block{block}", [*rows], rate, names, units)
     return found, list(content)
 
 

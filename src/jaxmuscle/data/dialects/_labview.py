@@ -6,7 +6,7 @@ import math
 import re
 
 from .._text_tables import cells_of, is_number, number_in
-from ._dialect import Above, Block, Dialect, Head, per_second
+from ._dialect import Above, Block, Dialect, Head, first_columns, frequency, per_second
 
 _END = re.compile(rb"^\*\*\*End_of_Header\*\*\*[^\n]*\n", re.MULTILINE)
 _AGAIN = re.compile(rb"^Channels[\t,]", re.MULTILINE)
@@ -67,8 +67,7 @@ def _without_comments(part: bytes) -> bytes:
     cells = line.rstrip(sign).split(sign)
     if cells[-1].strip(b'" ') != b"Comment" or len(cells) < 2:
         return part
-    row = b"(?m)^((?:[^S\n]*S){%d}[^S\n]*)S[^\n]*$" % (len(cells) - 2)
-    return re.sub(row.replace(b"S", re.escape(sign)), rb"\1", part)
+    return first_columns(part, sign, len(cells) - 1)
 
 
 def _head(stated: dict[str, list[str]], above: Above) -> Head | None:
@@ -78,28 +77,17 @@ def _head(stated: dict[str, list[str]], above: Above) -> Head | None:
         return None
     names, first = above.cells[-2], above.cells[-1]
     times = [j for j, name in enumerate(names) if name.startswith("X_Value")]
-    spoken = iter(
-        zip(
-            *(
-                _padded(stated, key, above.width)
-                for key in ("Delta_X", "Y_Unit_Label", "X_Dimension")
-            ),
-            strict=True,
-        )
-    )
-    rates, units, dimensions = [], [], []
-    for j in range(len(names)):
-        step, unit, dimension = ("", "", "") if j in times else next(spoken)
-        rates.append(per_second(number_in(step, None)) if is_number(step, None) else None)
-        units.append(unit)
-        dimensions.append(dimension)
+    # what is stated is stated of the signals in turn
+    rows = [
+        iter([*stated.get(key, ()), *[""] * above.width])
+        for key in ("Delta_X", "Y_Unit_Label", "X_Dimension")
+    ]
+    said = [("", "", "") if j in times else tuple(map(next, rows)) for j in range(above.width)]
+    steps, units, dimensions = map(list, zip(*said, strict=True))
     for j in times:
-        units[j] = "s" if first[j] and {"Time", ""} & set(dimensions) else ""
+        units[j] = "s" if first[j] and {"Time", ""} & {*dimensions} else ""
+    rates = [per_second(frequency(step)) for step in steps]
     return Head(names, units, rates=rates, counters=[j for j in times if not first[j]])
-
-
-def _padded(stated: dict[str, list[str]], key: str, width: int) -> list[str]:
-    return [*stated.get(key, []), *[""] * width][:width]
 
 
 LABVIEW = Dialect(blocks=_blocks)

@@ -3,7 +3,7 @@
 import functools
 import re
 
-from ._dialect import Above, Block, Dialect, Head
+from ._dialect import Above, Block, Dialect, Head, below_groups
 
 _BLOCK = re.compile(
     rb'^"?(devices|analog|trajectories|model outputs|joints|segments|force plates|events)"?'
@@ -45,17 +45,13 @@ def _head(rate: float, points: bool, above: Above) -> Head | None:
     at = next((i for i, row in enumerate(rows) if row[0].casefold() in _COUNTERS), None)
     if at is None:
         return None
-    names, device, devices = rows[at], "", []
-    for cell in rows[at - 1] if at else [""] * above.width:
-        device = cell or device
-        devices.append(device)
+    names = rows[at]
     counters = [j for j, name in enumerate(names) if name.casefold() in _COUNTERS]
-    whole = [
-        f"{device} {name}".strip()
-        if j not in counters and (points or names.count(name) > 1)
-        else name
-        for j, (device, name) in enumerate(zip(devices, names, strict=True))
-    ]
+    whole = below_groups(
+        names,
+        rows[at - 1] if at else [""] * above.width,
+        lambda j: j not in counters and (points or names.count(names[j]) > 1),
+    )
     units = rows[at + 1] if at + 1 < len(rows) else []
     units = ["" if j in counters else unit for j, unit in enumerate(units)]
     return Head(whole, units, rate, counters=counters)
