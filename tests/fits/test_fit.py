@@ -21,7 +21,8 @@ import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.fits import _search
-from jaxmuscle.fits._checks import AMBIGUOUS, Stage, rivals
+from jaxmuscle.fits._checks import AMBIGUOUS, rivals
+from jaxmuscle.fits._stages import Stage
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import BASE, DEFAULT_FREE, PARAMETERS
 from jaxmuscle.objective._arguments import free_names, planned
@@ -883,16 +884,32 @@ def test_progress_is_told_up_to_the_end():
         assert any(stage in text for text, _ in told)
 
 
-@pytest.mark.parametrize("stage", ["searching from", "correcting by"])
-def test_an_interrupted_fit_holds_what_had_been_reached(stage):
+def interruption(stage):
+    """What a fit calls with its progress, which interrupts at the second word of a stage."""
     count = 0
 
     def interrupt(text, share):
         nonlocal count
-        count += text.startswith(stage)
+        count += stage in text
         if count == 2:
             count = 3
             raise KeyboardInterrupt
+
+    return interrupt
+
+
+def test_a_fit_interrupted_in_its_first_model_holds_what_had_been_reached():
+    with pytest.raises(jm.fits.FitInterrupted) as caught:
+        progress = interruption("searching from")
+        jm.fit(jm.Isometric(), simple_target(), progress=progress, **QUICK)
+    (task,) = caught.value.tasks
+    assert type(task) is jm.Isometric and task["c_w"] != jm.Isometric()["c_w"]
+    assert "interrupted after 2 steps" in caught.value.result.message
+
+
+@pytest.mark.parametrize("stage", ["searching from", "correcting by"])
+def test_an_interrupted_fit_holds_what_had_been_reached(stage):
+    interrupt = interruption(stage)
 
     with pytest.raises(jm.fits.FitInterrupted) as caught:
         jm.fit(jm.Isometric(), simple_target(), free=FEW, progress=interrupt, **QUICK)

@@ -1,20 +1,19 @@
 """What looks wrong about a fit, in sentences: other minima, a nonlinear response, numbers that no
-muscle has. `_report.py` asks for it; `controlled_moments` and `seen_best` serve the search, too.
+muscle has. `_report.py` asks for it.
 """
 
 import dataclasses
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._consequences import BATCH, Expansion, consequences, expand, quantities
+from jaxmuscle.objective._consequences import BATCH, consequences, expand, quantities
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import Identifiability
 from jaxmuscle.objective._least_squares import SMALL, Minima
@@ -30,16 +29,14 @@ from jaxmuscle.objective._starts import (
     frequency_names,
     harmonic_frequencies,
 )
-from jaxmuscle.response._expected import Moments
-from jaxmuscle.response._expected_moments import expected_moments
-from jaxmuscle.simulation._trajectory import Trajectory
-from jaxmuscle.spectra._bin_law import BinStatistics, recorded_interval, trial_samples
+from jaxmuscle.spectra._bin_law import BinStatistics
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._result import Estimate, FittedPart, Start
+from ._stages import Stage, expand_at_best
 
 AMBIGUOUS, OTHER = 2.0, 3.0
-ALIKE = 0.5  # of costs: one minimum
+SAME_MINIMUM = 0.5  # of costs
 # how starts began, in words
 BEGAN = {
     PEAK: "from peaks",
@@ -68,44 +65,6 @@ FAST = (
     "The relaxation of the muscle smooths the force in the same way and may have taken its place."
     " Or power at high frequencies comes from elsewhere, as from the sensor"
 )
-
-
-class Stage(NamedTuple):
-    """A stage of a search: its name, the residuals it lowers, and where its starts stand."""
-
-    name: str
-    objective: Residuals
-    minima: Minima
-
-
-def controlled_moments(
-    runs: Trajectory, target: Target, task: AbstractTask
-) -> tuple[Moments, Moments | None]:
-    """Moments of every seed, whose mean has the expectation of the nonlinear model, and those of
-    the linear response.
-
-    With a control variate a seed's power is `e + p_i - l_i` (see `Trajectory.mean_spectrum`), and
-    so is its variance, e being that of a recording as long as the target's.
-    """
-    settings = target.settings
-    held = runs.filtered(settings)
-    power, variance = np.asarray(runs.spectrum(settings).power), held.var(axis=1)
-    expected = None
-    if runs.linear is not None:
-        sampled = trial_samples(target), recorded_interval(target, settings)
-        exact, _ = expected_moments(task, settings, WINDOW, *sampled)
-        expected = jax.tree.map(np.asarray, exact)
-        beside = runs.beside()
-        power = expected.power + power - np.asarray(beside.spectrum(settings).power)
-        variance = expected.variance + variance - beside.filtered(settings).var(axis=1)
-    line = np.zeros_like(power) if expected is None else np.broadcast_to(expected.line, power.shape)
-    mean = held.mean(axis=1)
-    return Moments(power, line, mean, variance), expected
-
-
-def seen_best(objective: Residuals, minima: Minima) -> Expansion:
-    """What the model gives at the best point."""
-    return expand(objective, np.asarray(objective.theta(minima.s))[[minima.best]]).row(0)
 
 
 def linear_check(
@@ -139,7 +98,7 @@ def polish_check(
         return {}
     before, after = stages[names.index("linear response")], stages[-1]
     old, new = (
-        problem.by_name(consequences(s.objective, seen_best(s.objective, s.minima)).values)
+        problem.by_name(consequences(s.objective, expand_at_best(s.objective, s.minima)).values)
         for s in (before, after)
     )
     # Of several targets, a quantity that is the same for all is that of the first.
@@ -273,10 +232,10 @@ def convergence(
     step = -np.linalg.pinv(curvature, hermitian=True) @ gradient
     gain = -0.5 * gradient @ step / max(cost, 1e-300)
     finite = [s.cost for s in starts if s.cost is not None]
-    there = [s.kind for s in starts if s.cost is not None and s.cost <= min(finite) + ALIKE]
+    there = [s.kind for s in starts if s.cost is not None and s.cost <= min(finite) + SAME_MINIMUM]
     kinds = Counter(there)
     census = (
-        f"{len(there)} of {len(starts)} starts reach this minimum (cost within {ALIKE:g};"
+        f"{len(there)} of {len(starts)} starts reach this minimum (cost within {SAME_MINIMUM:g};"
         f" {', '.join(f'{count} {BEGAN[kind]}' for kind, count in kinds.items())})"
     )
     if final.settled[final.best] or gain < SMALL:

@@ -37,9 +37,9 @@ from jaxmuscle.objective._starts import (
 )
 from jaxmuscle.spectra._peak_test import find_peaks
 
-from ._checks import Stage, seen_best
 from ._refit import lines_of, over_band, without_fitted
 from ._result import ADEQUATE, Estimate, Rung
+from ._stages import Stage, expand_at_best
 from ._verdict import Endpoint, drawn_log_residuals, generator_of
 
 NEAR = 0.25  # in the logarithm: what lies at a peak
@@ -194,7 +194,7 @@ def p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
     theta[:, columns[0]] = problem.coordinates.theta_of("harmonic_amplitude", ABSENT)
     objective = _pinned(objective, columns)
     without = least_squares(objective, problem.coordinates.from_theta(theta), STEPS)
-    ended = Endpoint(problem, objective, seen_best(objective, without))
+    ended = Endpoint(problem, objective, expand_at_best(objective, without))
     return _p_of_line(ended, np.delete(np.arange(len(names)), columns))
 
 
@@ -239,7 +239,7 @@ def _p_of_line(ended: Endpoint, kept: Int[np.ndarray, " kept"]) -> float:
 
 
 STARTS = 32
-ALIKE = 2.0
+AIC_MARGIN = 2.0  # by which a richer model than an adequate one must be better
 DESCENDED = 0.6  # a fit's progress when its descents have ended
 
 
@@ -295,10 +295,12 @@ def climb(
     models: Models,
     descend: Descend,
     keep: Callable[[Climbed], None],
+    begun: Callable[[Plan, list[Stage]], None],
     before: Climbed | None = None,
 ) -> tuple[Rung, ...]:
     """Fit one model after the other until one describes the data; `keep` gets each that is the best
-    so far.
+    so far. As long as there is none, `begun` gets the plan of a model and the stages of its search,
+    which are filled later.
 
     The best has the lowest AIC: a model that gains nothing is left out, and the next one is tried.
     An adequate model is no end in two cases, and a further one is then taken if its AIC is lower by
@@ -317,6 +319,8 @@ def climb(
         muscle = muscle_of_response(plan.problem) if muscle is None else muscle
         points, plan = _begin(plan, best or before, muscle)
         stages: list[Stage] = []
+        if best is None and before is None:
+            begun(plan, stages)
         share = DESCENDED / (models.top - models.lowest + 1)
         begin = len(tried) * share
         telling = _telling(
@@ -330,7 +334,7 @@ def climb(
         found = Climbed(plan, stages, known, ended, rung_of(ended, number))
         tried.append(found)
         described = best is not None and best.rung.p >= ADEQUATE
-        if best is None or found.rung.aic < best.rung.aic - ALIKE * described:
+        if best is None or found.rung.aic < best.rung.aic - AIC_MARGIN * described:
             best = found
             keep(found)
         if number == models.first >= RICHER["resonance"] and is_narrow(found):

@@ -24,7 +24,7 @@ CHUNK = 100
 STRENGTHS = np.geomspace(0.005, 20.0, 20)
 
 
-class Refit(NamedTuple):
+class LinearisedRefit(NamedTuple):
     """What a refit leaves of residuals, data rows and then those of the prior, with any of several
     lines as the harmonic.
 
@@ -76,9 +76,9 @@ class Refit(NamedTuple):
         return residuals + (rest - own) @ self.narrow.T
 
 
-def refit_of(
+def linearise_refit(
     problem: FitProblem, objective: Residuals, seen: Expansion, found: Consequences
-) -> Refit:
+) -> LinearisedRefit:
     """Lines of every frequency and strength in place of the fitted one, where a fit would have
     found them."""
     names, prior = problem.coordinates.names, problem.prior_root
@@ -90,7 +90,7 @@ def refit_of(
     alone = len(problem.parts) == 1 and len(free) == 2
     if not (alone and np.all(power > line) and np.any(line > 0)):
         taken = taken_up(np.concatenate([found.jacobian, prior]))[None]
-        return Refit(
+        return LinearisedRefit(
             np.zeros((1, taken.shape[1])),
             taken,
             np.zeros(1),
@@ -135,7 +135,7 @@ def refit_of(
     jacobian[:, -1] = -0.5 * prior[a, a] * level / sd[a]
     theta = seen.theta[f] + np.log(frequency / here) / sd[f]
     rows = np.append((prior @ seen.theta)[kept], prior[a, a] * seen.theta[a])
-    return Refit(
+    return LinearisedRefit(
         change,
         taken_up(jacobian),
         problem.prior[f] * (theta**2 - seen.theta[f] ** 2),

@@ -42,9 +42,7 @@ from jaxmuscle.spectra._bin_law import (
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._checks import (
-    Stage,
     array_notices,
-    controlled_moments,
     convergence,
     further_notices,
     linear_check,
@@ -60,6 +58,7 @@ from ._checks import (
 from ._intervals import Interval
 from ._model_choice import find_unseen, harmonic_test
 from ._result import Estimate, FitResult, FittedPart, Rung, Start
+from ._stages import Stage, controlled_moments
 from ._verdict import Endpoint, elsewhere
 
 OUTPUTS = (VARIATION, MEAN)

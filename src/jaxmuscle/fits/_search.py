@@ -25,10 +25,11 @@ from jaxmuscle.objective._starts import contenders, kinds_of_starts, recombined,
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
-from ._checks import AMBIGUOUS, Stage, controlled_moments, seen_best
+from ._checks import AMBIGUOUS
 from ._model_choice import Climbed, Models, climb, rung_of
 from ._report import UNCHECKED, report_fit
 from ._result import FitResult, Rung
+from ._stages import Stage, controlled_moments, expand_at_best
 from ._verdict import Endpoint
 
 FIRST_STEPS = 12
@@ -80,7 +81,11 @@ class _Search:
         """Go on from this model."""
         self.best = found
         self.plan, self.known = found.plan, found.known
-        self.stages[:] = found.stages
+        self.stages = found.stages
+
+    def begin(self, plan: Plan, stages: list[Stage]) -> None:
+        """Stand in the search of the first model, of which nothing is found yet."""
+        self.plan, self.stages = plan, stages
 
     def find(self, models: Models | None) -> None:
         """The best minimum of one model, or of the best of several."""
@@ -99,7 +104,7 @@ class _Search:
     def climb(self, models: Models) -> None:
         """One model after the other; of moved records again with the targets that the muscle of
         the chosen model sees."""
-        self.ladder = climb(models, _descended, self.keep)
+        self.ladder = climb(models, _descended, self.keep, self.begin)
         for _ in range(RENEWALS):
             richer = any(rung.chosen and rung.number > 0 for rung in self.ladder)
             if not richer or models.renewed is None:
@@ -107,7 +112,11 @@ class _Search:
             anew = models.renewed(_reached(self.plan, self.stages))
             # until they have been tried, what was found before stays
             better: list[Climbed] = []
-            tried = () if anew is None else climb(anew, _descended, better.append, self.best)
+            tried = (
+                ()
+                if anew is None
+                else climb(anew, _descended, better.append, self.begin, self.best)
+            )
             if anew is None or not better:
                 return
             self.ladder, models = tried, anew
@@ -390,7 +399,7 @@ def _montecarlo(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:
 def _known(problem: FitProblem, stage: Stage) -> tuple[FitProblem, list[Float[np.ndarray, " _"]]]:
     """What the best point says of how the data scatter: the problem with it, and the line's share
     of each bin."""
-    seen = seen_best(stage.objective, stage.minima)
+    seen = expand_at_best(stage.objective, stage.minima)
     shares = [
         np.clip(np.nan_to_num(moments.line / moments.power), 0.0, 1.0) for moments in seen.moments
     ]

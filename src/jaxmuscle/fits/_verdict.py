@@ -21,11 +21,11 @@ from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import PartResiduals, Residuals, further_residuals
 from jaxmuscle.response._expected import Moments
 
-from ._checks import Stage, seen_best
 from ._intervals import Interval, intervals
-from ._refit import STRENGTHS, Refit, refit_of
+from ._refit import STRENGTHS, LinearisedRefit, linearise_refit
 from ._result import ADEQUATE, Adequacy
 from ._signal_checks import SignalTest, check_signals
+from ._stages import Stage, expand_at_best
 
 ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
 REPLICATES = 999
@@ -49,7 +49,7 @@ class Endpoint:
     @classmethod
     def of(cls, problem: FitProblem, stage: Stage) -> "Endpoint":
         """The best point of a stage."""
-        return cls(problem, stage.objective, seen_best(stage.objective, stage.minima))
+        return cls(problem, stage.objective, expand_at_best(stage.objective, stage.minima))
 
     @functools.cached_property
     def found(self) -> Consequences:
@@ -67,9 +67,9 @@ class Endpoint:
         return np.asarray(block_diag(*each))
 
     @functools.cached_property
-    def refit(self) -> Refit:
+    def refit(self) -> LinearisedRefit:
         """What a refit leaves of residuals."""
-        return refit_of(self.problem, self.objective, self.seen, self.found)
+        return linearise_refit(self.problem, self.objective, self.seen, self.found)
 
     @functools.cached_property
     def covariance(self) -> Float[np.ndarray, "free free"]:
