@@ -23,10 +23,6 @@ def main() -> None:
         word.startswith("--seeds") for word in sys.argv
     ):
         os.environ.setdefault("PJRT_NPROC", "1")
-    if command == "ensemble":
-        from jaxmuscle._common.environment import UNDIVIDED_LOOPS
-
-        os.environ.setdefault("XLA_FLAGS", UNDIVIDED_LOOPS)
     # what is imported and loaded stays: to look through it again and again is of no use
     gc.set_threshold(50_000)
     with heard():

@@ -3,13 +3,14 @@ anything stands against it."""
 
 import os
 import threading
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from processes import ended, python, true_python
+from processes import SRC, ended, python, true_python
 
 import jaxmuscle as jm
 from jaxmuscle._common import programs
@@ -69,6 +70,59 @@ def test_a_fault_in_compiling_is_not_hidden(x64, folder, monkeypatch):
     monkeypatch.setattr(programs, "OPTIONS", {"xla_backend_optimization_level": "perhaps"})
     with pytest.raises(jax.errors.JaxRuntimeError, match="perhaps"):
         Kept(solved)(TASK, MATRIX)
+
+
+def stepped(x, size, unused, *, solve):
+    """Fifty steps of a loop, to which an input makes no difference, and which may call LAPACK."""
+
+    def step(state, number):
+        more = jnp.linalg.solve(jnp.diag(1 + state**2), state) if solve else state / (1 + state**2)
+        return state + size * more + jnp.where(size > -1, 0, unused), state[0] + number
+
+    return programs.in_one_piece(lambda: jax.lax.scan(step, x, jnp.arange(50.0)))
+
+
+ONE_PIECE = """
+import jax, numpy as np, test_kept
+from jaxmuscle._common import programs
+
+programs.program_folder = lambda: None
+for solve in (False, True):
+    with jax.enable_x64(True):
+        program = programs.Kept(test_kept.stepped, simulates=True)
+        test_kept.assert_stepped(program, solve)
+        print(solve, program.traces)
+"""
+
+
+def assert_stepped(program, solve):
+    """Against the same steps in NumPy."""
+    state, seen = np.linspace(0.1, 1, 6), []
+    last, found = program(state, np.array(0.1), np.ones(6), solve=solve)
+    for number in range(50):
+        seen.append(state[0] + number)
+        state = state + 0.1 * state / (1 + state**2)
+    np.testing.assert_allclose(last, state, rtol=1e-12)
+    np.testing.assert_allclose(found, seen, rtol=1e-12)
+
+
+@pytest.mark.parametrize("solve", [False, True])
+def test_a_loop_in_one_piece_has_the_same_numbers(x64, folder, solve):
+    """With LAPACK inside it cannot be one piece, and is traced a second time."""
+    program = Kept(stepped, simulates=True)
+    assert_stepped(program, solve)
+    assert program.traces == (2 if solve and jax.default_backend() == "cpu" else 1)
+    again = Kept(stepped, simulates=True)
+    assert_stepped(again, solve)
+    assert again.traces == 0
+
+
+def test_a_loop_in_one_piece_as_users_compile_it():
+    """XLA ends the process at a piece with an input that its simplification has made useless."""
+    here = Path(__file__).parent
+    folders = os.pathsep.join(map(str, (SRC, here, here.parent)))
+    said, _ = ended(true_python(ONE_PIECE, XLA_FLAGS="", PYTHONPATH=folders))
+    assert said.split() == ["False", "1", "True", "2"]
 
 
 def test_precision_makes_another_program(folder):

@@ -15,10 +15,6 @@ from typing import Any
 
 import platformdirs
 
-# For the environment variable XLA_FLAGS: a loop of less than a megabyte becomes one piece of
-# machine code. Else XLA splits what is inside it among all cores, although these are busy with
-# other seeds.
-UNDIVIDED_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
 LOG = logging.getLogger("jaxmuscle")
 
 

@@ -40,3 +40,7 @@ class ResultError(ValueError):
 
 class ProcessLostError(RuntimeError):
     """Another process of the run died or stopped."""
+
+
+class WorkersLostError(RuntimeError):
+    """The workers of an executor, or their scheduler, are lost."""

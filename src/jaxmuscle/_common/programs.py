@@ -13,7 +13,7 @@ import secrets
 import threading
 import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar
@@ -22,6 +22,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
+from jax.experimental.xla_metadata import set_xla_metadata
 
 from .environment import program_folder
 from .files import replacing
@@ -57,6 +58,11 @@ CONFIG = (
 # XLA's older way to make code of loops: compiled in half the time, loaded in three quarters, and
 # run as fast.
 OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+# Of AVX-512's registers LLVM uses half as a rule, since old processors slowed down when it used
+# them whole.
+WIDE = {"xla_cpu_prefer_vector_width": 512}
+# How XLA marks a loop that it makes one piece of machine code, without any call between its steps.
+IN_ONE_PIECE = {"inlineable": "false", "xla_cpu_small_call": "true"}
 UNUSED = 60 * 86400.0  # seconds
 LARGEST = 2**30  # bytes of the folder
 # jaxlib 0.10 cuts a batch of LAPACK's calls into pieces for its own threads and blocks one of them
@@ -109,10 +115,17 @@ class Kept:
     `JAXMUSCLE_CACHE=off` switches keeping off.
     """
 
-    def __init__(self, function: Callable[..., Any], options: Mapping[str, Any] | None = None):
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        options: Mapping[str, Any] | None = None,
+        *,
+        simulates: bool = False,
+    ):
         functools.update_wrapper(self, function)
         self.function = function
         self.options = OPTIONS if options is None else options
+        self.simulates = simulates
         self.jitted = eqx.filter_jit(function)
         self.programs: dict[Any, _Program] = {}
         self.traces = 0
@@ -180,10 +193,25 @@ class Kept:
             return tuple(x for x in leaves if _is_array(x))
 
         name = getattr(self.function, "__name__", "program")
-        flat.__name__ = name if folder is None else _unknown(name)
-        # Unused arguments stay: programs that say the same take the same arguments.
-        lowered = jax.jit(flat, keep_unused=True).lower(*arrays)
-        return _compiled(lowered, self.options, folder, place, shape[0])
+        name = name if folder is None else _unknown(name)
+
+        def program(options: Mapping[str, Any]) -> _Program:
+            traced = functools.partial(flat)  # new, so that JAX traces it anew
+            traced.__name__ = name  # pyright: ignore[reportAttributeAccessIssue]
+            # Unused arguments stay: programs that say the same take the same arguments.
+            lowered = jax.jit(traced, keep_unused=True).lower(*arrays)
+            return _compiled(lowered, options, folder, place, shape[0])
+
+        if not self.simulates or jax.default_backend() != "cpu":
+            return program(self.options)
+        wide = {**self.options, **WIDE} if " avx512f " in _machine() else self.options
+        try:
+            with _whole_loops():
+                return program(wide)
+        except jax.errors.JaxRuntimeError as error:
+            # A muscle of the user's own may call what such a loop cannot hold (LAPACK, a sort).
+            LOG.debug("%s: not in one piece: %s", name, error)
+            return program(wide)
 
 
 def _machine_code(lowered: Any, options: Mapping[str, Any]) -> Any:
@@ -236,6 +264,43 @@ def kept_to_run_long(function: Callable[P, R]) -> Callable[P, R]:
     """As `kept`, for a program that runs longer than it compiles: XLA's newer emitters make it a
     tenth faster."""
     return Kept(function, {})
+
+
+def kept_simulation(function: Callable[P, R]) -> Callable[P, R]:
+    """As `kept`, for a program of many steps: with wide vectors where the processor has them, and
+    with what is `in_one_piece`."""
+    return Kept(function, simulates=True)
+
+
+_WHOLE = threading.local()
+
+
+@contextlib.contextmanager
+def _whole_loops() -> Iterator[None]:
+    _WHOLE.wanted = True
+    try:
+        yield
+    finally:
+        _WHOLE.wanted = False
+
+
+def in_one_piece(function: Callable[[], R]) -> R:
+    """Call a function whose loops become one piece of machine code in a kept simulation.
+
+    Else XLA calls the runtime at every step of a loop, several times, and splits what is inside
+    among all cores, although these are busy with other seeds.
+    """
+    if not getattr(_WHOLE, "wanted", False):
+        return function()
+    arrays, rest = eqx.partition(eqx.filter_closure_convert(function), eqx.is_array)
+
+    @jax.jit
+    def piece(arrays: Any) -> Any:
+        # What goes in comes out again: XLA ends the process at an input that nothing in the piece
+        # uses, as when it has found out that it makes no difference.
+        return eqx.combine(arrays, rest)(), arrays
+
+    return jax.lax.optimization_barrier(set_xla_metadata(piece(arrays), **IN_ONE_PIECE))[0]
 
 
 def forget() -> None:

@@ -12,7 +12,7 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Integer, PRNGKeyArray
 
 from jaxmuscle._common.environment import usable_cores
-from jaxmuscle._common.programs import kept
+from jaxmuscle._common.programs import kept_simulation
 from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._decimation import at_every
@@ -102,7 +102,7 @@ def blocks(seeds: int, lanes: int) -> int:
     return -(-seeds // lanes)
 
 
-@kept
+@kept_simulation
 def run_seeds(
     task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None
 ) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def run_seeds(
     return _shared(local, mesh, (P(), P("lanes")))(arrays, seeds)
 
 
-@kept
+@kept_simulation
 def run_points(
     tasks: Any, linears: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None
 ) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxmuscle._common.programs import in_one_piece
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._signals import AbstractSignal, Constant, Tabulated
 from jaxmuscle.model._stream import Stream
@@ -268,21 +269,25 @@ def integrated(
 
     # Time counts the steps that are left: diffrax joins a last step to one that ends within a
     # hundred units in the last place of its end, and of 131 200 in single precision these are two.
-    solution = dfx.diffeqsolve(
-        term,
-        SubcycledHeun(),
-        t0=-float(grid.steps),
-        t1=0.0,
-        dt0=float(grid.every),
-        y0=begun,
-        stepsize_controller=dfx.ConstantStepSize(),
-        saveat=dfx.SaveAt(t0=True, steps=1, fn=kept),
-        max_steps=grid.steps // grid.every,
-        adjoint=dfx.DirectAdjoint() if grid.reverse else dfx.ForwardMode(),
-        throw=False,
+    solved = in_one_piece(
+        lambda: (
+            dfx.diffeqsolve(
+                term,
+                SubcycledHeun(),
+                t0=-float(grid.steps),
+                t1=0.0,
+                dt0=float(grid.every),
+                y0=begun,
+                stepsize_controller=dfx.ConstantStepSize(),
+                saveat=dfx.SaveAt(t0=True, steps=1, fn=kept),
+                max_steps=grid.steps // grid.every,
+                adjoint=dfx.DirectAdjoint() if grid.reverse else dfx.ForwardMode(),
+                throw=False,
+            ).ys
+        )
     )
     found = jax.tree.map(
-        lambda rows: jnp.moveaxis(rows[: grid.steps // grid.every + 1], 0, 1), solution.ys
+        lambda rows: jnp.moveaxis(rows[: grid.steps // grid.every + 1], 0, 1), solved
     )
     seen, path = found["seen"], jnp.stack(found["states"], axis=2) if states else None
     if instants:

@@ -1,0 +1,140 @@
+"""Work that any executor of `concurrent.futures`, or a Dask client, does in blocks: results in one
+order, whoever works and however many."""
+
+import itertools
+import logging
+import queue
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError, Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+
+import jax
+
+from .errors import WorkersLostError
+
+LOG = logging.getLogger("jaxmuscle")
+Item = TypeVar("Item")
+Made = TypeVar("Made")
+# Blocks under way or waiting for an earlier one. More keep more workers busy; what they return
+# waits in memory, up to 4 MB each.
+WINDOW = 512
+PATIENCE = 60.0  # seconds without a result after which it is looked for workers
+AGAIN = (
+    "What is complete stays where there is a store: the same call or command again, with resume"
+    " (--resume), goes on"
+)
+
+
+class DaskClient(Protocol):
+    """What is needed of a `distributed.Client`."""
+
+    def get_executor(self, **options: Any) -> Executor: ...
+
+    def scheduler_info(self) -> dict[str, Any]: ...
+
+
+AnyExecutor = Executor | DaskClient
+
+
+class Block(NamedTuple, Generic[Item, Made]):
+    """Work on one item in a worker, in the precision of the caller, which is a setting of each
+    process."""
+
+    work: Callable[[Item], Made]
+    double: bool
+
+    def __call__(self, item: Item) -> Made:
+        with jax.enable_x64(self.double):
+            return self.work(item)
+
+
+def pool_of(executor: AnyExecutor) -> Executor:
+    """The executor to submit to.
+
+    **Raises:** `ValueError` for what is no executor, and for processes that are forked: a fork of
+    a process in which JAX has begun waits for ever.
+    """
+    if hasattr(executor, "get_executor"):
+        # pure: Dask would take two calls with equal arguments for one
+        return executor.get_executor(pure=False)  # pyright: ignore[reportAttributeAccessIssue]
+    if not isinstance(executor, Executor):
+        raise ValueError(
+            f"executor = {executor!r}: give an executor of concurrent.futures or a Dask client"
+        )
+    context = getattr(executor, "_mp_context", None)
+    if context is not None and context.get_start_method() == "fork":
+        raise ValueError(
+            "executor: its processes are forked, and JAX does not run in a fork. Make it with"
+            ' ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
+        )
+    return executor
+
+
+def results_of(
+    executor: AnyExecutor, work: Callable[[Item], Made], items: Iterable[Item]
+) -> Iterator[tuple[Item, Made]]:
+    """Every item and `work(item)`, in the order of the items.
+
+    At most `WINDOW` items are under way. `work` may be done twice for an item, where a worker is
+    lost, so it must do no harm. A result is given up as soon as it is here: Dask computes again
+    what a lost worker had and somebody still wants.
+
+    **Raises:** what `work` raises; `WorkersLostError` if the workers, or their scheduler, are lost.
+    """
+    pool, call = pool_of(executor), Block(work, bool(jax.config.jax_enable_x64))  # pyright: ignore[reportAttributeAccessIssue]
+    rest, ended = enumerate(items), queue.SimpleQueue()
+    under_way: dict[Future[Any], tuple[int, Any]] = {}
+    waiting: dict[int, tuple[Any, Any]] = {}
+    turn = itertools.count()
+    wanted = next(turn)
+    try:
+        while True:
+            room = WINDOW - len(under_way) - len(waiting)
+            for number, item in itertools.islice(rest, room):
+                future = _submitted(pool, call, item)
+                under_way[future] = number, item
+                future.add_done_callback(ended.put)
+            if not under_way:
+                return
+            future = _next_ended(ended, executor)
+            number, item = under_way.pop(future)
+            waiting[number] = item, _result(future)
+            del future
+            while wanted in waiting:
+                yield waiting.pop(wanted)
+                wanted = next(turn)
+    finally:
+        for future in under_way:
+            future.cancel()
+
+
+def _submitted(pool: Executor, call: Any, item: Any) -> Future[Any]:
+    try:
+        return pool.submit(call, item)
+    except BrokenProcessPool as error:
+        raise WorkersLostError(f"a worker died ({error}). {AGAIN}") from error
+
+
+def _next_ended(ended: "queue.SimpleQueue[Future[Any]]", executor: AnyExecutor) -> Future[Any]:
+    while True:
+        try:
+            return ended.get(timeout=PATIENCE)
+        except queue.Empty:
+            if isinstance(executor, Executor):
+                continue
+            if not executor.scheduler_info().get("workers"):
+                LOG.warning("notice: the scheduler has no workers now; waiting for some to come")
+
+
+def _result(future: Future[Any]) -> Any:
+    try:
+        return future.result()
+    except (CancelledError, BrokenProcessPool) as error:
+        raise WorkersLostError(
+            f"the workers, or their scheduler, are lost ({type(error).__name__}). {AGAIN}"
+        ) from error
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] == "distributed":
+            raise WorkersLostError(f"{error}. {AGAIN}") from error
+        raise
