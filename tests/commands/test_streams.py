@@ -9,7 +9,7 @@ import sys
 
 import pytest
 import tomli_w
-from in_process import POWER, run
+from in_process import GRID, POWER, run, write_recording
 from processes import ended, environment, python
 from test_result import made_result
 

@@ -197,7 +197,7 @@ def test_bundled_targets_are_no_figures(option, word):
 def test_command_passes_dataset_and_axis_on(tmp_path, monkeypatch):
     path, seen = write(tmp_path, wide()), []
     monkeypatch.setattr(jm, "fit", lambda _, target, **__: seen.append(target))
-    monkeypatch.setattr(_cli_fit, "_fit_one", lambda fit, *_, **__: fit(None, None) is None)
+    monkeypatch.setattr(_cli_fit, "_fit_one", lambda fit, *_, **__: fit() is None)
     result = CliRunner().invoke(app, ["fit", str(path), "--dataset", "b", "--segments", "6"])
     assert result.exit_code == 0 and seen[0] == load_target(path, dataset="b", segments=6)
     table = write(tmp_path, pairs(*np.log10([GRID, spectrum(GRID)])), "decades.csv")

@@ -54,9 +54,7 @@ def fitted(tmp_path_factory):
 def test_a_response_alone_knows_no_noise_that_would_limit_a_further_measurement(fitted):
     result = jm.load_result(fitted[0] / "fit.json")
     report = jm.identifiability(result)
-    assert not report.designs and f"dynamic stiffness at {F.size} frequencies" in " ".join(
-        str(report).split()
-    )
+    assert not report.designs
     assert "no further measurement is tried: the fit has no spectrum" in " ".join(
         str(report).split()
     )

@@ -153,9 +153,14 @@ def test_information_adds_up(x64):
     assert f"low: {held}, P_w = 4 N; high: {held}, P_w = 8 N" in found.present.task
 
 
-def test_a_design_names_the_target_that_it_is_like():
-    design = jm.uncertainty.Design("longer", segments=100, target="high")
-    assert "P_w = 8 N" in jm.identifiability(both(), designs=[design]).designs[0].task
+def test_a_design_is_like_the_target_that_it_names():
+    """More of one target tells more of what is this target's own."""
+    designs = [jm.uncertainty.Design(name, segments=100, target=name) for name in ("high", "low")]
+    high, low = jm.identifiability(both(), designs=designs).designs
+    for name, more, less in (("high", high, low), ("low", low, high)):
+        corner = f"corner_frequency@{name}"
+        assert more.quantities[corner].stderr < less.quantities[corner].stderr
+    design = designs[0]
     with pytest.raises(ValueError, match=r"longer: target: the fit has none called 'middle'"):
         jm.identifiability(both(), designs=[dataclasses.replace(design, target="middle")])
 

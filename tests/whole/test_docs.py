@@ -9,6 +9,7 @@ import operator
 import re
 import textwrap
 import types
+import typing
 from collections import Counter
 
 import jax

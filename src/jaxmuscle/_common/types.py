@@ -14,4 +14,4 @@ if TYPE_CHECKING:
     Seeds = int | np.integer | Sequence[int] | np.ndarray
 else:
     Key = Seed = Seeds = Any  # checked by `keys.key_of` and `keys.seed_of`, with a sentence
-    Scalar = Float[Array, "..."] | Float[np.ndarray, "..."] | float | int
+    Scalar = Float[Array, "..."] | Float[np.ndarray, "..."] | np.floating | float | int

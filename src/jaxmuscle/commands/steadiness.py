@@ -57,7 +57,11 @@ def steadiness(
             from jaxmuscle._common.arguments import positive
 
             positive("--mvc", mvc)
-        if len(paths) == 1 and jm.data.kind_of_file(paths[0]) == "study":
+        is_study = len(paths) == 1 and (
+            # no recording is a .toml: what is wrong with one is said as of a study
+            paths[0].lower().endswith(".toml") or jm.data.kind_of_file(paths[0]) == "study"
+        )
+        if is_study:
             if band is not None:
                 raise ValueError(
                     "--band: of a study leave it out; the band is that of the quantity"
