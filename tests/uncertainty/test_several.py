@@ -158,7 +158,7 @@ def test_a_design_is_like_the_target_that_it_names():
     high, low = jm.identifiability(both(), designs=designs).designs
     assert not np.allclose(high.singular_values, low.singular_values, rtol=1e-3)
     design = designs[0]
-    with pytest.raises(ValueError, match=r"longer: target: the fit has none called 'middle'"):
+    with pytest.raises(ValueError, match=r"high: target: the fit has none called 'middle'"):
         jm.identifiability(both(), designs=[dataclasses.replace(design, target="middle")])
 
 
