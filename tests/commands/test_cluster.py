@@ -10,6 +10,8 @@ import pytest
 from jaxmuscle.commands import cluster
 from jaxmuscle.commands.cluster import workers_of
 
+THREADS = "MALLOC_TRIM_THRESHOLD_", "OMP_NUM_THREADS", "PJRT_NPROC"
+
 dask = pytest.importorskip("dask")
 
 
@@ -22,7 +24,7 @@ def as_loud_as_before():
 
 
 def environment_of(_):
-    return {name: os.environ.get(name) for name in ("MALLOC_TRIM_THRESHOLD_", "OMP_NUM_THREADS")}
+    return {name: os.environ.get(name) for name in THREADS}
 
 
 def test_neither_is_this_process():
@@ -39,7 +41,7 @@ def test_workers_of_our_own_are_quick_lasting_and_out_of_reach(monkeypatch):
         assert dask.config.get("distributed.deploy.lost-worker-timeout") == "10m"
         assert client.cluster.scheduler.allowed_failures == 100
         found = client.get_executor(pure=False).submit(environment_of, 0).result()
-        assert found == {"MALLOC_TRIM_THRESHOLD_": None, "OMP_NUM_THREADS": "1"}
+        assert found == dict(zip(THREADS, (None, "1", "1"), strict=True))
         (pid,) = client.run(os.getpid).values()
     assert dask.config.get("distributed.deploy.lost-worker-timeout") != "10m"
     with pytest.raises(ProcessLookupError):

@@ -69,8 +69,10 @@ def workers_of(count: int | None, scheduler: str | None) -> Iterator[Any]:
             " workers"
         )
     require_extra("dask")
-    # What goes wrong is said in sentences of the command.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    import distributed  # noqa: F401  # sets its own levels
+
+    for name in ("distributed", "distributed.client"):  # what goes wrong is said in one sentence
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with _client_here(count) if scheduler is None else _client_of(scheduler) as client:
         yield client
 
@@ -93,6 +95,8 @@ def _client_here(count: int | None) -> Iterator[Any]:
             protocol="tcp",
             dashboard_address="127.0.0.1:0",
             memory_limit=0,  # as this process, which has none
+            # XLA's other threads would spin beside those of the other workers
+            env={"PJRT_NPROC": "1"},
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
