@@ -296,3 +296,13 @@ def x64():
     """Run the test in float64."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture(scope="session")
+def client():
+    """Two workers of Dask, for all tests of a process."""
+    pytest.importorskip("distributed")
+    from jaxmuscle.commands.cluster import workers_of
+
+    with workers_of(2, None) as client:
+        yield client

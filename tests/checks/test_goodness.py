@@ -3,6 +3,7 @@ errors against refits."""
 
 import functools
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import scipy.special
 import scipy.stats
+from elsewhere import Pickled
 from refits import without_intervals
 
 import jaxmuscle as jm
@@ -355,6 +357,18 @@ def test_bootstrap_of_a_sigma_draws_from_the_gaussian_law():
         assert low < q.ratio < high and q.inside[0] >= least, (q.name, q.ratio, q.inside)
     np.testing.assert_array_equal(a, b)
     assert np.all(a != c)
+
+
+def test_who_refits_does_not_change_a_bit():
+    result, pickled = fits([expected()], segments=None, sigma=0.2 * expected())[0], Pickled()
+    with without_intervals(), ThreadPoolExecutor(2) as threads:
+        here, *others = (
+            jm.checks.bootstrap(result, replicates=6, key=1, executor=executor)
+            for executor in (None, threads, pickled)
+        )
+    assert pickled.count == 2
+    for other in others:
+        assert other.to_json() == here.to_json()
 
 
 @pytest.mark.slow

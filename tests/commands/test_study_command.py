@@ -1,6 +1,8 @@
 """`jaxmuscle study`: mistakes in one line, a folder that is not overwritten unasked, what is
 printed."""
 
+import contextlib
+
 import numpy as np
 import pandas
 import pytest
@@ -9,6 +11,8 @@ from test_study import made_study
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
+from jaxmuscle._common.errors import WorkersLostError
+from jaxmuscle.commands import study as study_command
 from jaxmuscle.commands.main import app
 
 
@@ -41,6 +45,29 @@ def test_mistakes(options, message, table, tmp_path):
     result = command(table, "--out", tmp_path / "out", *options)
     assert result.exit_code == 2 and message in result.stderr, result.stderr
     assert not (tmp_path / "out" / "study.json").exists()
+
+
+def test_other_processes_do_the_work(table, tmp_path, monkeypatch):
+    asked = []
+
+    @contextlib.contextmanager
+    def workers_of(*given):
+        asked.append(given)
+        yield "client"
+
+    def run_study(path, **options):
+        asked.append(options["executor"])
+        raise WorkersLostError("the workers are lost. Again")
+
+    monkeypatch.setattr(study_command, "workers_of", workers_of)
+    monkeypatch.setattr(jm, "run_study", run_study)
+    lost = command(table, "--out", tmp_path / "out", "--scheduler", "host:8786")
+    assert lost.exit_code == 1 and "failed: the workers are lost. Again" in lost.stderr
+    command(table, "--out", tmp_path / "out", "--workers", 3)
+    assert asked == [(None, "host:8786"), "client", (3, None), "client"]
+    monkeypatch.undo()
+    both = command(table, "--out", tmp_path / "out", "--workers", 2, "--scheduler", "host:8786")
+    assert both.exit_code == 2 and "--workers 2 and --scheduler host:8786: give one" in both.stderr
 
 
 def test_a_study_is_overwritten_only_with_force(table, tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from elsewhere import Pickled
 
 import jaxmuscle as jm
 from jaxmuscle.data._study_table import cells_of_study, read_study
@@ -239,3 +240,31 @@ def test_a_file_that_cannot_be_read_is_named_by_its_line(folder):
     rows = read_study(written(folder, "file,person\na1.npy,anna\nb1.npy,bea\n")).rows
     with pytest.raises(ValueError, match=r"study.csv: line 2: .*rate"):
         cells_of_study(rows, {})
+
+
+def test_files_are_read_elsewhere_from_any_folder_with_the_same_numbers_and_errors(
+    folder, monkeypatch
+):
+    monkeypatch.chdir(folder)
+    told, executor = [], Pickled()
+    rows = read_study(written(folder, TABLE).name).rows
+    here = cells_of_study(rows, {"units": "N"})
+    there = cells_of_study(rows, {"units": "N"}, executor, lambda *each: told.append(each))
+    assert repr([cell.target.to_table() for cell in here]) == repr(
+        [cell.target.to_table() for cell in there]
+    )
+    assert [cell[:5] for cell in here] == [cell[:5] for cell in there]
+    assert told == [("reading recordings", 0.5), ("reading recordings", 1.0)]
+    assert executor.count == 2  # one for each person
+    (folder / "b1.npy").write_bytes(b"no array")
+    for row, units in ((3, "V"), (4, None)):
+        given = [dict(r.reading, file=r.file, person=r.person) for r in rows]
+        given = [
+            g | ({"units": units} if i == row - 2 and units else {}) for i, g in enumerate(given)
+        ]
+        messages = []
+        for who in (None, executor):
+            with pytest.raises(ValueError) as error:
+                cells_of_study(read_study(given).rows, {"units": "N"}, who)
+            messages.append(str(error.value).replace(str(folder) + "/", ""))
+        assert messages[0] == messages[1] and f"row {row - 1}: " in messages[0], messages

@@ -3,6 +3,7 @@ intervals."""
 
 import functools
 import io
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.stats
+from elsewhere import Pickled
 from refits import without_intervals
 from rich.console import Console
 from test_fit import true_derived
@@ -248,6 +250,34 @@ def test_of_a_model_that_misses_the_data_only_what_is_measured_is_compared():
     sure = {n for n, m in results["a"].measured.items() if m.stderr is not None}
     assert compared == sure and "median_frequency" in sure
     assert {row["target"] for row in found.table() if row["quantity"] == "c_w"} == {"a", "b"}
+
+
+def test_who_fits_does_not_change_a_bit():
+    """Five in two blocks."""
+    rng = np.random.default_rng(5)
+    powers = np.exp(0.2 * rng.standard_normal((5, 30))) / (1 + np.arange(1, 31) ** 2)
+    targets = [jm.Target(f"p{n}", power, segments=12) for n, power in enumerate(powers)]
+    targets.append("nobody")
+    options = {"starts": 3, "free": ("c_w", "k_w", "noise_K_w"), "max_steps": 6}
+    told, pickled = [], Pickled()
+    with without_intervals(), ThreadPoolExecutor(2) as threads:
+        here, *others = (
+            jm.fit_cohort(
+                targets, executor=executor, progress=lambda *each: told.append(each), **options
+            )
+            for executor in (None, threads, pickled)
+        )
+    assert list(here.results) == [f"p{n}" for n in range(5)] and list(here.failed) == ["nobody"]
+    assert pickled.count == 2
+    assert [each for each in told if each[0].endswith(" fits")] == 2 * [
+        ("4 of 5 fits", 0.8),
+        ("5 of 5 fits", 1.0),
+    ]
+    for other in others:
+        assert repr(other.table()) == repr(here.table()) and other.failed == here.failed
+        assert [str(result) for result in other.results.values()] == [
+            str(result) for result in here.results.values()
+        ]
 
 
 def test_one_bad_target_does_not_stop_the_rest(tmp_path):

@@ -5,6 +5,7 @@ import csv
 import dataclasses
 import functools
 import json
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
@@ -12,6 +13,7 @@ import numpy as np
 import pages
 import pytest
 import scipy
+from elsewhere import Pickled
 from refits import without_intervals
 from test_result import made_result
 
@@ -429,10 +431,39 @@ def test_five_trials_of_everybody_allow_two_resonances(trials, rung, recorded, m
         asked.append(options["rung"])
         return jm.fits.CohortResult({}, {}, {target.name: "not fitted" for target in targets})
 
-    monkeypatch.setattr(_study, "cells_of_study", lambda rows, usual: cells)
+    monkeypatch.setattr(_study, "cells_of_study", lambda *_: cells)
     monkeypatch.setattr(_study, "fit_cohort", fit_cohort)
     found = jm.run_study(recorded / "study.csv")
     assert asked == [rung] and found.options["rung"] == rung
+
+
+def small_study(folder, executor=None):
+    """The same study in any process, as text."""
+    found = jm.run_study(folder / "study.toml", starts=1, executor=executor)
+    return json.dumps(_study.to_table(found)), str(found)
+
+
+def test_who_reads_and_fits_does_not_change_a_bit(recorded):
+    pickled, told = Pickled(), []
+    with without_intervals(), ThreadPoolExecutor(2) as threads:
+        here = small_study(recorded)
+        assert small_study(recorded, threads) == here
+        assert small_study(recorded, pickled) == here
+        jm.run_study(
+            recorded / "study.toml",
+            fit=False,
+            executor=pickled,
+            progress=lambda *each: told.append(each),
+        )
+    assert pickled.count == 8 + 2 + 8  # cells are read, blocks of four are fitted
+    assert told[-1] == ("reading recordings", 1.0)
+
+
+@pytest.mark.slow
+def test_two_workers_are_one_process_to_the_last_bit(recorded, client):
+    """Both with the compiler's options of a command."""
+    alone = client.get_executor(pure=False).submit(small_study, recorded).result()
+    assert small_study(recorded, client) == alone
 
 
 @pytest.mark.slow

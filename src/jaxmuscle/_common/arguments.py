@@ -13,7 +13,7 @@ import numpy as np
 from .text import choices
 
 # of the extras that are asked for before the work begins
-EXTRAS = {"posterior": ("blackjax", "arviz_stats")}
+EXTRAS = {"posterior": ("blackjax", "arviz_stats"), "dask": ("dask", "distributed")}
 
 
 def require(holds: bool | np.bool, name: str, value: object, remedy: str) -> None:

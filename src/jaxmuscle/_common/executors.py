@@ -1,13 +1,13 @@
 """Work that any executor of `concurrent.futures`, or a Dask client, does in blocks: results in one
 order, whoever works and however many."""
 
+import contextlib
 import itertools
 import logging
 import queue
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import CancelledError, Executor, Future
-from concurrent.futures.process import BrokenProcessPool
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 
@@ -26,6 +26,7 @@ AGAIN = (
 )
 
 
+@runtime_checkable
 class DaskClient(Protocol):
     """What is needed of a `distributed.Client`."""
 
@@ -55,9 +56,9 @@ def pool_of(executor: AnyExecutor) -> Executor:
     **Raises:** `ValueError` for what is no executor, and for processes that are forked: a fork of
     a process in which JAX has begun waits for ever.
     """
-    if hasattr(executor, "get_executor"):
+    if isinstance(executor, DaskClient):
         # pure: Dask would take two calls with equal arguments for one
-        return executor.get_executor(pure=False)  # pyright: ignore[reportAttributeAccessIssue]
+        return executor.get_executor(pure=False)
     if not isinstance(executor, Executor):
         raise ValueError(
             f"executor = {executor!r}: give an executor of concurrent.futures or a Dask client"
@@ -110,10 +111,8 @@ def results_of(
 
 
 def _submitted(pool: Executor, call: Any, item: Any) -> Future[Any]:
-    try:
+    with _losses():
         return pool.submit(call, item)
-    except BrokenProcessPool as error:
-        raise WorkersLostError(f"a worker died ({error}). {AGAIN}") from error
 
 
 def _next_ended(ended: "queue.SimpleQueue[Future[Any]]", executor: AnyExecutor) -> Future[Any]:
@@ -128,13 +127,20 @@ def _next_ended(ended: "queue.SimpleQueue[Future[Any]]", executor: AnyExecutor) 
 
 
 def _result(future: Future[Any]) -> Any:
-    try:
+    with _losses():
         return future.result()
-    except (CancelledError, BrokenProcessPool) as error:
-        raise WorkersLostError(
-            f"the workers, or their scheduler, are lost ({type(error).__name__}). {AGAIN}"
-        ) from error
+
+
+@contextlib.contextmanager
+def _losses() -> Iterator[None]:
+    """What an executor says that lost its workers, and Dask of its own, as one error."""
+    try:
+        yield
     except Exception as error:
-        if type(error).__module__.partition(".")[0] == "distributed":
-            raise WorkersLostError(f"{error}. {AGAIN}") from error
-        raise
+        if isinstance(error, CancelledError | BrokenExecutor):
+            why = f"the workers, or their scheduler, are lost ({type(error).__name__})"
+        elif type(error).__module__.partition(".")[0] == "distributed":
+            why = str(error)
+        else:
+            raise
+        raise WorkersLostError(f"{why}. {AGAIN}") from error

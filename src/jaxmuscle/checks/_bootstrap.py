@@ -13,6 +13,7 @@ from jaxtyping import Float
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import fitting, versions
+from jaxmuscle._common.executors import AnyExecutor
 from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.keys import number_of
 from jaxmuscle._common.progress import told
@@ -21,7 +22,7 @@ from jaxmuscle._common.text import folded
 from jaxmuscle._common.types import Key
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
-from jaxmuscle.fits._search import search_together
+from jaxmuscle.fits._search import search_in_blocks
 from jaxmuscle.objective._arguments import Plan, base_of, settings_of
 from jaxmuscle.objective._consequences import expand, quantities
 from jaxmuscle.objective._likelihood import require_spread
@@ -286,7 +287,6 @@ class Bootstrap(Printed, Result, eqx.Module):
 
 
 STARTS = 32
-TOGETHER = 50
 SIMULATED = "recordings simulated nonlinearly"
 DRAWN = (
     "spectra drawn from the Gaussian law of their sigma, not simulated: the target states no"
@@ -300,6 +300,7 @@ def bootstrap(
     replicates: int = 50,
     key: Key = 0,
     progress: bool | Callable[[str, float], None] = False,
+    executor: AnyExecutor | None = None,
 ) -> Bootstrap:
     """Whether the standard errors of a fit hold: data are made from the fitted task and fitted
     again.
@@ -323,12 +324,14 @@ def bootstrap(
     - `replicates`: how many data sets are made and fitted
     - `key`: a `jax.random` key or a seed number
     - `progress`: True or a function of (text, share)
+    - `executor`: who fits the replicates, as in `fit_cohort`; they are made in this process
 
     **Returns:** a `Bootstrap`; replicates that could not be simulated or fitted are in `failed`,
     with the reason.
 
     **Raises:** `ValueError` for a target without segments and sigma, a failed fit, a task without
-    linear response, a fit that determines nothing, fewer than 2 replicates.
+    linear response, a fit that determines nothing, fewer than 2 replicates; `WorkersLostError` for
+    an executor whose workers or scheduler are lost.
     """
     if replicates < 2:
         raise ValueError(f"replicates = {replicates} must be at least 2: one refit has no spread")
@@ -343,7 +346,7 @@ def bootstrap(
         problem = reopened(result, key=key)
         tell("making data", 0.0)
         made, failed = replicates_of(problem, tuple(result.tasks.values()), replicates)
-        fits, more = _fitted(problem, result, made, tell)
+        fits, more = _fitted(problem, result, made, tell, executor)
         true = _true(problem, result)
     found = (
         {
@@ -388,28 +391,25 @@ def _true(problem: FitProblem, result: FitResult) -> dict[str, float]:
 
 
 def _fitted(
-    problem: FitProblem, result: FitResult, made: Made, tell: Callable[[str, float], None]
-) -> Any:
+    problem: FitProblem,
+    result: FitResult,
+    made: Made,
+    tell: Callable[[str, float], None],
+    executor: AnyExecutor | None,
+) -> tuple[list[FitResult], dict[int, str]]:
     """Refits that succeeded, and why others did not."""
-    fits: list[FitResult] = []
-    failed: dict[int, str] = {}
-    numbers = list(made)
     settings = (
         result.settings | {"starts": STARTS} | settings_of(problem, result.settings["bounds"])
     )
-    for start in range(0, len(numbers), TOGETHER):
-        part = numbers[start : start + TOGETHER]
+    plans = [
+        Plan(with_data(problem, data), STARTS, settings["max_steps"], 0, settings, None)
+        for data in made.values()
+    ]
 
-        def show(text: str, share: float, before: int = start, size: int = len(part)) -> None:
-            tell(text, 0.1 + 0.9 * (before + share * size) / len(numbers))
+    def show(text: str, share: float) -> None:
+        tell(text, 0.1 + 0.9 * share)
 
-        plans = [
-            Plan(with_data(problem, made[n]), STARTS, settings["max_steps"], 0, settings, None)
-            for n in part
-        ]
-        for number, fit in zip(part, search_together(plans, show, replicates=True), strict=True):
-            if fit.success:
-                fits.append(fit)
-            else:
-                failed[number] = fit.message
-    return fits, failed
+    found = search_in_blocks(executor, [plans], show, replicates=True)
+    fits = dict(zip(made, found, strict=True))
+    failed = {number: fit.message for number, fit in fits.items() if not fit.success}
+    return [fit for fit in fits.values() if fit.success], failed

@@ -86,7 +86,7 @@ def reporting(as_json: bool = False) -> Iterator[None]:
 
     With `as_json` the text for people stays away from stdout, which is for `record` alone.
     """
-    from jaxmuscle._common.errors import SimulationError
+    from jaxmuscle._common.errors import SimulationError, WorkersLostError
 
     out.quiet = as_json
     try:
@@ -94,7 +94,7 @@ def reporting(as_json: bool = False) -> Iterator[None]:
     except (ValueError, OSError, ImportError) as error:
         say_failure(_words(error), "error")
         raise typer.Exit(BAD_INPUT) from None
-    except SimulationError as error:
+    except (SimulationError, WorkersLostError) as error:
         say_failure(error)
         raise typer.Exit(NOT_CONVERGED) from None
     except KeyboardInterrupt:

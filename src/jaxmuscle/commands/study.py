@@ -7,6 +7,7 @@ import typer
 
 import jaxmuscle as jm
 
+from .cluster import Scheduler, Workers, workers_of
 from .console import (
     CONVERGED,
     NOT_CONVERGED,
@@ -83,6 +84,8 @@ def study(
     seed: Seed = 0,
     output: Output = Path("out"),
     formats: Formats = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     force: Force = False,
     as_json: Json = False,
     reading: dict[str, Any],
@@ -104,23 +107,27 @@ def study(
         jaxmuscle study study.csv --out out/study
 
         jaxmuscle study study.toml --correction fdr --quantities mean,tremor_frequency
+
+        jaxmuscle study study.csv --workers 8 --out out/study
     """
     with reporting(as_json):
         span = edges_of(window)
         _writable(output, table, force=force)
-        found = jm.run_study(
-            table,
-            rung=int(rung) if rung is not None and rung.isdigit() else rung,
-            noise=None if noise is None else str(noise),
-            quantities=names_in(quantities, "--quantities"),
-            alpha=alpha,
-            correction=correction,
-            key=seed,
-            progress=True,
-            window=span,
-            spectrum=None if spectrum is None else str(spectrum),
-            **_given(reading),
-        )
+        with workers_of(workers, scheduler) as executor:
+            found = jm.run_study(
+                table,
+                rung=int(rung) if rung is not None and rung.isdigit() else rung,
+                noise=None if noise is None else str(noise),
+                quantities=names_in(quantities, "--quantities"),
+                alpha=alpha,
+                correction=correction,
+                key=seed,
+                progress=True,
+                executor=executor,
+                window=span,
+                spectrum=None if spectrum is None else str(spectrum),
+                **_given(reading),
+            )
         write_study(found, output, formats_of(formats))
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)
 

@@ -13,8 +13,11 @@ from msgspec import Meta
 
 from jaxmuscle._common.arguments import is_real, require
 from jaxmuscle._common.documents import Table, checked, parsed, says
+from jaxmuscle._common.environment import one_thread
+from jaxmuscle._common.executors import AnyExecutor, results_of
 from jaxmuscle._common.files import expanded
 from jaxmuscle._common.inputs import looked_at, read_text
+from jaxmuscle._common.progress import Tell, nothing
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import NAMED
 
@@ -301,15 +304,36 @@ def files_of_study(path: str | os.PathLike[str]) -> list[Path]:
     return [*found.files, *(row.file for row in found.rows)]
 
 
-def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cell]:
+class _Trial(NamedTuple):
+    """A recording of a cell: its row, how its file is read, in which window."""
+
+    row: Row
+    reading: dict[str, Any]
+    window: Any
+
+
+class _Wanted(NamedTuple):
+    """What makes a cell: its trials, the settings of their spectra, the mvc."""
+
+    trials: tuple[_Trial, ...]
+    settings: str
+    mvc: float | None
+
+
+def cells_of_study(
+    rows: Iterable[Row],
+    defaults: Mapping[str, Any],
+    executor: AnyExecutor | None = None,
+    tell: Tell = nothing,
+) -> list[Cell]:
     """The trials of every person in every condition made one target, each in its own or the
-    `defaults`' window, or steady.
+    `defaults`' window, or steady; files are read on an `executor`, if there is one.
 
     **Raises:** `ValueError` naming the line of a file that cannot be read or has no steady part, of
     a spectrum or a unit that is not that of the others, and of an mvc that is not that of the same
     person in the same condition.
     """
-    together: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
+    together: dict[tuple[str, str, str], list[_Trial]] = defaultdict(list)
     stated: dict[Any, tuple[Row, Any]] = {}
 
     def as_before(row: Row, key: Any, name: str, value: Any, remedy: str) -> None:
@@ -330,20 +354,46 @@ def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cel
             as_before(row, "spectrum", "spectrum", spectrum or "standard", remedy)
             remedy = "give all trials of a person in a condition the same mvc, or none"
             as_before(row, whose, "mvc", mvc, remedy)
-            recording = load_recording(row.file, **reading)
-            remedy = "give all in one unit, with the column units or by converting the files"
-            as_before(row, "unit", "unit", recording.unit, remedy)
-            together[whose].append(recording.steady(window))
-    found = []
-    for whose, recordings in together.items():
-        person, _, condition = whose
-        name = ", ".join(filter(None, (person, condition)))
-        first, mvc = stated[whose]
+        # a worker may be in another folder
+        there = row if executor is None else row._replace(file=row.file.absolute())
+        together[whose].append(_Trial(there, reading, window))
+    wanted = [
+        _Wanted(tuple(trials), stated["spectrum"][1], stated[whose][1])
+        for whose, trials in together.items()
+    ]
+    each = (
+        ((w, _cell(w)) for w in wanted) if executor is None else results_of(executor, _cell, wanted)
+    )
+    cells = []
+    for number, (cell_wanted, (units, cell)) in enumerate(each, 1):
+        for trial, unit in zip(cell_wanted.trials, units, strict=True):
+            with _named(trial.row.place):
+                remedy = "give all in one unit, with the column units or by converting the files"
+                as_before(trial.row, "unit", "unit", unit, remedy)
+        cells.append(cell)
+        tell("reading recordings", number / len(wanted))
+    return cells
+
+
+def _cell(wanted: _Wanted) -> tuple[list[str], Any]:
+    """The units of a cell's recordings, and the cell; None if they are not the same."""
+    recordings, first = [], wanted.trials[0].row
+    with one_thread:  # so that any machine gives the same bits
+        for row, reading, _ in wanted.trials:
+            with _named(row.place):
+                recordings.append(load_recording(row.file, **reading))
+        units = [recording.unit for recording in recordings]
+        if len(set(units)) > 1:
+            return units, None
+        for i, (row, _, window) in enumerate(wanted.trials):
+            with _named(row.place):
+                recordings[i] = recordings[i].steady(window)
+        name = ", ".join(filter(None, (first.person, first.condition)))
         with _named(f"{first.place}: {name}"):
-            target = Trials(recordings).target(name, mvc=mvc, settings=stated["spectrum"][1])
-        rates = tuple(recording.rate for recording in recordings)
-        found.append(Cell(*whose, len(recordings), rates, target))
-    return found
+            target = Trials(recordings).target(name, mvc=wanted.mvc, settings=wanted.settings)
+    rates = tuple(recording.rate for recording in recordings)
+    whose = first.person, first.group, first.condition
+    return units, Cell(*whose, len(recordings), rates, target)
 
 
 @contextlib.contextmanager

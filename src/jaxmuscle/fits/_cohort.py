@@ -12,6 +12,7 @@ import numpy as np
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Card, Result
 from jaxmuscle._common.environment import fitting
+from jaxmuscle._common.executors import AnyExecutor
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.upward import load_above
@@ -29,7 +30,7 @@ from ._differences import Difference, between_groups
 from ._model_choice import options_for
 from ._perturbed import aimed
 from ._result import FitResult
-from ._search import search_together
+from ._search import search_in_blocks
 
 if TYPE_CHECKING:
     import pandas
@@ -164,9 +165,10 @@ def fit_cohort(
     task: type[AbstractTask] | None = None,
     rung: int = 0,
     progress: bool | Callable[[str, float], None] = False,
+    executor: AnyExecutor | None = None,
     **options: Unpack[SearchOptions],
 ) -> CohortResult:
-    """Fit many targets, in linear response, all starts of all of them in one batch.
+    """Fit many targets, in linear response, all starts of four targets in one batch.
 
         names = "vastus-lateralis-26mvc", "fdi-abduction-45mvc"
         targets = [jm.load_target(name) for name in names]
@@ -188,11 +190,15 @@ def fit_cohort(
     - `rung`: the model of all of them (`on_rung`: 0 the base model, 1 with activation, 2 with
       resonance, 3 with a second one), so that their numbers can be compared
     - `progress`: True or a function of (text, share)
+    - `executor`: who fits the batches, an executor of `concurrent.futures` (whose processes are not
+      forked) or a Dask client; by default this process, one after the other. The results are the
+      same to the last bit.
 
     **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these
     options, is listed in `failed` with the reason and does not stop the rest.
 
-    **Raises:** `ValueError` for no targets, equal names and a group of an unknown target.
+    **Raises:** `ValueError` for no targets, equal names and a group of an unknown target;
+    `WorkersLostError` for an executor whose workers or scheduler are lost.
     """
     asked = FitOptions.of(fit_cohort, SearchOptions, {"starts": 32, **options})
     loaded, failed = _loaded(targets, on_rung(PrescribedLength(), rung) if rung else None)
@@ -202,7 +208,6 @@ def fit_cohort(
             f"groups: no target is called {', '.join(sorted(unknown))}; there are"
             f" {', '.join(loaded)}"
         )
-    results: dict[str, FitResult] = {}
     with told(progress, f"fitting {len(loaded)} targets") as tell, fitting():
         batches: dict[Any, dict[str, Plan]] = {}
         for name, target in loaded.items():
@@ -214,8 +219,9 @@ def fit_cohort(
                 failed[name] = str(error)
                 continue
             batches.setdefault(_alike(plan), {})[name] = plan
-        for batch in batches.values():
-            results |= zip(batch, search_together(list(batch.values()), tell, rung), strict=True)
+        names = [name for batch in batches.values() for name in batch]
+        plans = [list(batch.values()) for batch in batches.values()]
+        results = dict(zip(names, search_in_blocks(executor, plans, tell, rung), strict=True))
     ordered = {name: results[name] for name in loaded if name in results}
     return CohortResult(
         ordered, {name: (groups or {})[name] for name in ordered if name in (groups or {})}, failed

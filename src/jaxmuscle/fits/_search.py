@@ -4,7 +4,7 @@ interrupted. `_fit.py` and `_joint.py` call `search`, cohorts and bootstraps `se
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -12,8 +12,11 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.errors import SimulationError
+from jaxmuscle._common.executors import AnyExecutor, results_of
 from jaxmuscle._common.keys import fold_in
+from jaxmuscle._common.progress import nothing
 from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan
@@ -39,6 +42,9 @@ MANY = 64
 RIVAL_MARGIN = 6.0
 POLISHES = 4
 STILL = 2e-3
+# Data that are fitted together. How many must not depend on who works: the last bits of a fit may
+# hang on its neighbours. With 32 starts each they fill the programs' rows; more gain nothing.
+TOGETHER = 4
 RENEWALS = 2  # of the target of a moved record, where a richer model than the base one was chosen
 TOLD = {
     "trying starts": "searching from all starting points",
@@ -189,6 +195,41 @@ def _unchecked(
     """The result before anything is simulated to check it."""
     plan = plan._replace(check_seeds=0)
     return report_fit(plan, stages, ladder, ended=ended, interrupted=interrupted, preliminary=True)
+
+
+def search_in_blocks(
+    executor: AnyExecutor | None,
+    batches: Iterable[list[Plan]],
+    tell: Callable[[str, float], None],
+    number: int = 0,
+    *,
+    replicates: bool = False,
+) -> Iterator[FitResult]:
+    """`search_together` of `TOGETHER` fits of a batch after the other, on an executor or in this
+    process: the same results to the last bit, in order."""
+    blocks = [batch[i : i + TOGETHER] for batch in batches for i in range(0, len(batch), TOGETHER)]
+    search = functools.partial(_searched, number=number, replicates=replicates)
+    done, whole = 0, sum(map(len, blocks))
+    if executor is not None:
+        for block, results in results_of(executor, search, blocks):
+            done += len(block)
+            tell(f"{done} of {whole} fits", done / whole)
+            yield from results
+        return
+    for block in blocks:
+
+        def show(text: str, share: float, done: int = done, size: int = len(block)) -> None:
+            tell(text, (done + share * size) / whole)
+
+        yield from search(block, show)
+        done += len(block)
+
+
+def _searched(
+    plans: list[Plan], tell: Callable[[str, float], None] = nothing, **how: Any
+) -> list[FitResult]:
+    with fitting():  # also in a worker
+        return search_together(plans, tell, **how)
 
 
 def search_together(

@@ -19,6 +19,7 @@ from jaxmuscle import plot
 from jaxmuscle._common.arguments import check_options
 from jaxmuscle._common.cards import Card, Result
 from jaxmuscle._common.environment import versions
+from jaxmuscle._common.executors import AnyExecutor
 from jaxmuscle._common.figures import remove_figures, write_figure
 from jaxmuscle._common.files import nulled, remove, write_json, write_text
 from jaxmuscle._common.keys import check_key
@@ -59,6 +60,7 @@ MEASURED = (
 )
 RESONANCES = ("resonance_frequency", "resonance_2_frequency")
 TRIALS_OF_TWO = 5  # in every condition of everybody, for a model with two resonances
+READ = 0.1  # of the work, all files
 NAMES = ("person", "group", "condition", "trials")
 DROPPED = ("target", "group", "mvc_fraction")
 Whose = tuple[str, str]  # a person in a condition
@@ -421,6 +423,7 @@ def run_study(
     starts: int = 32,
     key: Key = 0,
     progress: bool | Tell = False,
+    executor: AnyExecutor | None = None,
     **options: Unpack[StudyOptions],
 ) -> StudyResult:
     """Measure the recordings of a whole study, fit them with one model, and compare groups and
@@ -440,7 +443,7 @@ def run_study(
       has the columns file (relative to the table) and person; it may have group, condition, trial,
       window_start, window_stop and those of the last item but window. Or a .toml with `table =
       "study.csv"` or `[[recordings]]` of the same fields, and any of the options below but `fit`,
-      `starts`, `key` and `progress`. Or rows, as dictionaries.
+      `starts`, `key`, `progress` and `executor`. Or rows, as dictionaries.
     - `fit`: False for the measured part alone, without any model.
     - `rung`: the model of all people (`on_rung`), 0 to 3. By default 3, whose second resonance is
       the slower rhythm, where everybody has five trials or more in every condition, else 2, with
@@ -457,6 +460,9 @@ def run_study(
       kind (groups, conditions, interaction) are corrected together, measured quantities and those
       of the model apart.
     - `progress`: True or a function of (text, share).
+    - `executor`: who reads the files and fits, an executor of `concurrent.futures` (whose processes
+      are not forked) or a Dask client; by default this process. The results are the same to the
+      last bit. Its workers must find the files by the same paths.
     - How files are read where a row does not say it: `window` (start, stop) [s] or "all" (by
       default the steady part); `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`,
       `sheet`, `max_gap`, `outliers`, `lever_arm`, `quantity`, `baseline`, `detrend` as in
@@ -468,7 +474,8 @@ def run_study(
 
     **Returns:** a `StudyResult`.
 
-    **Raises:** `ValueError` naming file, line and column, or the argument, and the remedy.
+    **Raises:** `ValueError` naming file, line and column, or the argument, and the remedy;
+    `WorkersLostError` for an executor whose workers or scheduler are lost.
     """
     check_key(key)
     check_options(run_study, StudyOptions, options)
@@ -479,11 +486,18 @@ def run_study(
     used = used | {"starts": starts, "key": key}
     with told(progress, f"study of {len({row.person for row in table.rows})} people") as tell:
         tell("reading recordings", 0.0)
-        cells = cells_of_study(table.rows, usual)
+        most = READ if fit else 1.0
+        cells = cells_of_study(
+            table.rows, usual, executor, lambda text, share: tell(text, most * share)
+        )
         if used["rung"] is None:
             fewest = min(cell.trials for cell in cells)
             used["rung"] = 3 if fewest >= TRIALS_OF_TWO else 2
-        cohort, aic = _fitted(cells, used, tell) if fit else (CohortResult({}, {}, {}), {})
+        cohort, aic = CohortResult({}, {}, {}), {}
+        if fit:
+            cohort, aic = _fitted(
+                cells, used, lambda text, share: tell(text, READ + (1 - READ) * share), executor
+            )
     return StudyResult(cohort, tuple(cells), aic, used | {"reading": usual}, table.source)
 
 
@@ -516,7 +530,7 @@ def _checked(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fitted(
-    cells: list[Cell], options: dict[str, Any], tell: Tell
+    cells: list[Cell], options: dict[str, Any], tell: Tell, executor: AnyExecutor | None
 ) -> tuple[CohortResult, dict[int, float]]:
     """The fits on the rung that is asked for, or on that of lowest AIC; and the AIC of each that
     was tried.
@@ -543,6 +557,7 @@ def _fitted(
             progress=lambda text, share, which=which, i=first: tell(
                 which + text, (i + share) / len(numbers)
             ),
+            executor=executor,
         )
         table = np.array([[_aic(cohort, cell) for cell in cells] for cohort in tried.values()])
         table = table[:, np.isfinite(table).any(axis=0)]
