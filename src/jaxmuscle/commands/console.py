@@ -75,7 +75,7 @@ def reporting(as_json: bool = False) -> Iterator[None]:
 
     With `as_json` the text for people stays away from stdout, which is for `record` alone.
     """
-    from jaxmuscle._common.errors import SimulationError
+    from jaxmuscle._common.errors import SimulationError, WorkersLostError
 
     out.quiet = as_json
     try:
@@ -83,7 +83,7 @@ def reporting(as_json: bool = False) -> Iterator[None]:
     except (ValueError, OSError, ImportError) as error:
         err.print(f"[bold red]error:[/] {plain(_words(error))}", highlight=False)
         raise typer.Exit(BAD_INPUT) from None
-    except SimulationError as error:
+    except (SimulationError, WorkersLostError) as error:
         err.print(f"[bold red]failed:[/] {plain(error)}", highlight=False)
         raise typer.Exit(NOT_CONVERGED) from None
     except KeyboardInterrupt:
