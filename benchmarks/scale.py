@@ -5,12 +5,11 @@ import contextlib
 import json
 import os
 import resource
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -215,19 +214,9 @@ class Pace(NamedTuple):
 
 
 def processes(repetitions: int) -> list[Row]:
-    """`jaxmuscle ensemble` as one process, as several of `jax.distributed` on the loopback, and as
-    parts that do not know of each other, with their merging. On a core each, or left to find
-    one."""
-    cores = sorted(os.sched_getaffinity(0))
-    ways = {"1": (1, _parts, None)}
-    ways |= {
-        f"{count} {name}": (count, way, None)
-        for name, way in (("joined", _joined), ("parts", _parts))
-        for count in (2, 4)
-    }
-    if len(cores) > 1:
-        ways |= {"1 on a core": (1, _parts, cores), "2 parts on a core each": (2, _parts, cores)}
-    turns = [{name: _pace(*way) for name, way in ways.items()} for _ in range(repetitions)]
+    """`jaxmuscle ensemble` as one process with one thread, and with two workers."""
+    ways = {"one thread": ("--threads", "1"), "two workers": ("--workers", "2")}
+    turns = [{name: _pace(way) for name, way in ways.items()} for _ in range(repetitions)]
     found = []
     for name in ways:
         short, wall, processor = np.median([turn[name] for turn in turns], axis=0).tolist()
@@ -236,80 +225,40 @@ def processes(repetitions: int) -> list[Row]:
             Row(f"processes: {name}, speed by processor time", processor, "seeds/s"),
             Row(f"processes: {name}, whole command with start", short, "s"),
         ]
-        if name not in ("1", "1 on a core"):
-            base = "1 on a core" if "core" in name else "1"
-            ratio = float(np.median([turn[name].wall / turn[base].wall for turn in turns]))
-            found.append(
-                Row(
-                    f"processes: speed of {name}",
-                    ratio,
-                    "times",
-                    base,
-                    1.7 if "core" in name else None,
-                )
-            )
-    return found
-
-
-def _joined(count: int) -> list[list[str]]:
-    """Arguments of each process of one program."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        port = listener.getsockname()[1]
+    one, two = ([turn[name] for turn in turns] for name in ways)
+    speed = float(np.median([b.wall / a.wall for a, b in zip(one, two, strict=True)]))
+    time_ = float(np.median([a.processor / b.processor for a, b in zip(one, two, strict=True)]))
     return [
-        ["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--process-id", str(i)]
-        for i in range(count)
+        *found,
+        Row("processes: speed of two workers", speed, "times", "one thread", 1.7),
+        Row(
+            "processes: two workers, processor time",
+            time_,
+            "times",
+            "one thread",
+            1.2,
+            at_most=True,
+        ),
     ]
 
 
-def _parts(count: int) -> list[list[str]]:
-    """Arguments of each part; none if there is only one."""
-    return [["--part", f"{i}/{count}"] for i in range(1, count + 1)] if count > 1 else [[]]
-
-
-def _pace(count: int, arguments: Callable[[int], list[list[str]]], cores: list[int] | None) -> Pace:
+def _pace(way: tuple[str, ...]) -> Pace:
     few, many = 32_768, 425_984
-    (short, busy), (long, busier) = (
-        _command(arguments(count), cores, seeds) for seeds in (few, many)
-    )
+    (short, busy), (long, busier) = (_command(way, seeds) for seeds in (few, many))
     return Pace(short, (many - few) / (long - short), (many - few) / (busier - busy))
 
 
-def _command(each: list[list[str]], cores: list[int] | None, seeds: int) -> tuple[float, float]:
-    """Wall and processor time [s] of the command, as so many processes at once."""
+def _command(way: tuple[str, ...], seeds: int) -> tuple[float, float]:
+    """Wall and processor time [s] of the command and its workers."""
     with tempfile.TemporaryDirectory() as folder:
-        store = f"{folder}/a.zarr"
-        command = [
-            sys.executable,
-            "-m",
-            "jaxmuscle",
-            "ensemble",
-            "zagrodny-slifkin",
-            "--seeds",
-            str(seeds),
-            "--reduce",
-            "--duration",
-            "1",
-            "--threads",
-            "1",
-            "--out",
-            store,
-        ]
-        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        command = [sys.executable, "-m", "jaxmuscle", "ensemble", "zagrodny-slifkin", "--reduce"]
+        given = ["--seeds", str(seeds), "--duration", "1", "--out", f"{folder}/a.zarr"]
         begun, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-        workers = []
-        for number, more in enumerate(each):
-            bound = [] if cores is None else ["taskset", "--cpu-list", str(cores[number])]
-            workers.append(subprocess.Popen([*bound, *command, *more], **quiet))
-        codes = [worker.wait() for worker in workers]
-        if each[0][:1] == ["--part"]:
-            codes.append(
-                subprocess.run(
-                    [sys.executable, "-m", "jaxmuscle", "merge", store], **quiet
-                ).returncode
-            )
-        if any(codes):
-            raise Unequal(f"processes: {' '.join(each[0])} failed")
+        done = subprocess.run(
+            [*command, *given, *way], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        if done.returncode:
+            raise Unequal(f"processes: {' '.join(way)} failed")
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
         return time.perf_counter() - begun, busy

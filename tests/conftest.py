@@ -155,6 +155,14 @@ def _optimise_only_what_runs_often() -> None:
 
     programs.kept = kept
     programs.kept_to_run_long = lambda function: programs.Kept(function, _AsCommands({}))
+    machine_code = programs._machine_code
+
+    def as_commands(lowered: Any, options: Any) -> Any:
+        """Simulations, which say no level: each loads the other's, and where they are rounded does
+        not depend on what else they give back."""
+        return machine_code(lowered, {OPTIMISATION: 1} | dict(options))
+
+    programs._machine_code = as_commands
 
 
 DPI, SAVED = figures.DPI, Figure.savefig

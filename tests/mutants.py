@@ -134,15 +134,15 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             "ensembles/_ensemble",
             "ensembles/_layout",
-            "ensembles/_parts",
-            "ensembles/_places",
+            "ensembles/_chunks",
+            "ensembles/_opening",
             "ensembles/_run",
             "ensembles/_store",
             "ensembles/_summary",
             "ensembles/_running_moments",
             "ensembles/_sweep",
         ),
-        ("ensemble", "job_array"),
+        ("ensemble", "stores", "workers"),
     ),
 }
 ARITHMETIC = {

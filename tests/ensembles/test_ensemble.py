@@ -1,15 +1,14 @@
-"""Ensembles at scale: reduced, stored, swept, on several devices and by several processes, killed
-and resumed."""
+"""Ensembles at scale: reduced, stored, swept, on threads and several devices, killed and
+resumed."""
 
 import contextlib
 import json
 import random
 import shutil
-import signal
-import socket
 import subprocess
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -18,25 +17,22 @@ import numpy as np
 import pytest
 import scipy.signal
 import xarray
-from processes import command, ended, python, true_command
+from processes import command, ended, python
 from test_simulate import Integral
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
-from jaxmuscle.ensembles import _layout as layouts
+from jaxmuscle.ensembles import _chunks, _settings
 from jaxmuscle.ensembles import _run as _ensemble_run
-from jaxmuscle.ensembles import _settings
-from jaxmuscle.ensembles._processes import join
 from jaxmuscle.ensembles._running_moments import (
     CELLS,
     add,
     count_cells,
+    edges_of,
     empty,
-    merged,
     moments,
     quantiles,
-    set_cells,
 )
 from jaxmuscle.ensembles._store import differences
 from jaxmuscle.simulation import _batch
@@ -73,14 +69,12 @@ def test_seeds_fit_into_so_many_blocks(seeds, count):
 
 
 @pytest.mark.parametrize("pieces", [1, 3, 40])
-def test_merged_moments_are_those_of_the_whole(pieces):
+def test_moments_of_pieces_are_those_of_the_whole(pieces):
     """Also far from zero, where sums of squares would have lost all digits."""
     rows = 1e6 + np.random.default_rng(0).normal(size=(400, 5)) * [1, 2, 3, 1e-3, 0]
     whole = empty(1, 5, 5, 1, whole=True)
     for part in np.array_split(rows, pieces):
-        piece = empty(1, 5, 5, 1, whole=True)
-        add(piece, 0, moments(part))
-        whole = merged(whole, piece)
+        add(whole, 0, moments(part))
     assert whole.seeds.tolist() == [400]
     np.testing.assert_allclose(whole.mean[0], rows.mean(axis=0), rtol=1e-14)
     np.testing.assert_allclose(
@@ -101,9 +95,10 @@ def test_counted_quantiles_are_within_a_cell_of_the_exact_ones():
     )
     levels = (0.01, 0.3, 0.5, 0.95, 0.999)
     tally = empty(1, 4, 4, len(levels), whole=False)
-    set_cells(tally, 0, output[:256])
+    tally.low[0], tally.high[0] = edges_of(output[:256])
     for part in np.array_split(output, 7):
-        add(tally, 0, moments(part)._replace(cells=count_cells(tally.low[0], tally.high[0], part)))
+        add(tally, 0, moments(part))
+        tally.cells[0] += count_cells(tally.low[0], tally.high[0], part)
     found = quantiles(tally, levels)[0]
     exact = np.quantile(output, levels, axis=0, method="inverted_cdf")
     assert np.all(np.abs(found - exact) <= (tally.high - tally.low)[0] / CELLS)
@@ -111,9 +106,10 @@ def test_counted_quantiles_are_within_a_cell_of_the_exact_ones():
 
 def test_a_quantile_beyond_the_cells_is_not_made_up():
     tally = empty(1, 1, 1, 2, whole=False)
-    set_cells(tally, 0, np.random.default_rng(0).normal(size=(100, 1)))
+    tally.low[0], tally.high[0] = edges_of(np.random.default_rng(0).normal(size=(100, 1)))
     output = np.concatenate([np.random.default_rng(1).normal(size=(80, 1)), np.full((20, 1), 1e3)])
-    add(tally, 0, moments(output)._replace(cells=count_cells(tally.low[0], tally.high[0], output)))
+    add(tally, 0, moments(output))
+    tally.cells[0] += count_cells(tally.low[0], tally.high[0], output)
     middle, far = quantiles(tally, (0.4, 0.9))[0, :, 0]
     assert np.isfinite(middle) and np.isnan(far)
 
@@ -280,8 +276,12 @@ def test_draws_of_any_shape_make_a_design():
         (lambda: jm.ensemble(TASK, KEY, seeds=1, chunk=0), "chunk = 0"),
         (lambda: jm.ensemble(TASK, KEY, seeds=1, resume=True), "resume = True belongs to a store"),
         (lambda: jm.ensemble(TASK, KEY, seeds=1, reduce=(0.5, 1.0)), "between 0 and 1"),
-        (lambda: join("localhost:1", 2, None), "belong together"),
-        (lambda: join("localhost:1", 2, 2), "--process-id = 2 must be from 0 to"),
+        (lambda: jm.ensemble(TASK, KEY, seeds=1, store="s3://a/b"), "give the path of a folder"),
+        (lambda: jm.ensemble(TASK, KEY, seeds=1, executor=2), "executor = 2: give an executor"),
+        (
+            lambda: jm.ensemble(TASK, KEY, seeds=1, threads=1, executor=ThreadPoolExecutor()),
+            "threads = 1 belongs to one process",
+        ),
     ],
 )
 def test_bad_input_is_refused(make, message):
@@ -313,7 +313,7 @@ def test_a_store_holds_what_memory_would(tmp_path):
         "x_w",
         "zarr.json",
     ]
-    assert [p.name for p in tmp_path.iterdir()] == ["runs.zarr"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".runs.zarr.lock", "runs.zarr"]
 
 
 def test_a_store_of_a_sweep_has_points(tmp_path):
@@ -370,6 +370,7 @@ def test_an_interrupted_store_is_resumed(tmp_path, monkeypatch, reduce):
         assert xarray.open_zarr(path).attrs["complete"] is False
     with pytest.raises(ValueError, match="exists already; resume it"):
         jm.ensemble(TASK, KEY, seeds=45, store=path, **kept, **SHORT)
+    there = 3 if reduce else len(list((path / "F_ext" / "c").iterdir()))
     left = []
     found = jm.ensemble(
         TASK,
@@ -381,8 +382,8 @@ def test_an_interrupted_store_is_resumed(tmp_path, monkeypatch, reduce):
         **kept,
         **SHORT,
     )
-    # The last chunk before an interruption is done but was not told of yet: it is not repeated.
-    assert len(left) == 6 - 3
+    # The last chunks before an interruption are done but were not told of: they are not repeated.
+    assert len(left) == 6 - there and there >= 3
     whole = jm.ensemble(TASK, KEY, seeds=45, **kept, **SHORT)
     close(found.mean if reduce else found["F_ext"], whole.mean if reduce else whole.output)
     if reduce:
@@ -398,7 +399,7 @@ def test_an_interrupted_store_is_resumed(tmp_path, monkeypatch, reduce):
         **kept,
         **SHORT,
     )
-    assert len(left) == 3, "a complete store is not run again"
+    assert len(left) == 6 - there, "a complete store is not run again"
     assert type(again) is type(found)
     assert not (path / "progress").exists()
 
@@ -539,7 +540,7 @@ def test_a_folder_that_cannot_be_written(read_only):
         jm.ensemble(TASK, KEY, seeds=8, store=read_only / "a.zarr", **SHORT)
 
 
-# Threads, devices and processes
+# Threads and devices
 
 
 class Slow:
@@ -548,13 +549,13 @@ class Slow:
 
     def __init__(self, monkeypatch, chunks):
         self.simulate, self.left, self.busy, self.most, self.lock = (
-            layouts._finish,
+            _chunks._finish,
             chunks,
             0,
             0,
             threading.Lock(),
         )
-        monkeypatch.setattr(layouts, "_finish", self)
+        monkeypatch.setattr(_chunks, "_finish", self)
 
     def __call__(self, chunk, found):
         with self.lock:
@@ -600,7 +601,7 @@ def test_what_a_thread_raises_ends_the_ensemble(monkeypatch):
     def broken(chunk, found):
         raise MemoryError("no room")
 
-    monkeypatch.setattr(layouts, "_finish", broken)
+    monkeypatch.setattr(_chunks, "_finish", broken)
     with pytest.raises(MemoryError, match="no room"):
         jm.ensemble(TASK, KEY, seeds=45, threads=3, **SHORT)
 
@@ -667,112 +668,11 @@ np.savez({str(tmp_path / "found.npz")!r}, runs=runs.output, sweep=sweep, store=s
     close(found["sweep"], np.stack([np.asarray(member.output) for member in sweep]))
 
 
-def free_port():
-    """One below those that Linux hands out (from 32768), so that nobody else gets it before it is
-    used."""
-    while True:
-        port = random.SystemRandom().randrange(20_000, 32_768)
-        with socket.socket() as listener, contextlib.suppress(OSError):
-            listener.bind(("127.0.0.1", port))
-            return port
-
-
-def started(count, arguments, folder, begin=(command,) * 3):
-    """Several processes of `jaxmuscle ensemble` on the loopback."""
-    common = [
-        "ensemble",
-        "zagrodny-slifkin",
-        *arguments,
-        "--coordinator",
-        f"127.0.0.1:{free_port()}",
-    ]
-    each = [[*common, "--processes", str(count), "--process-id", str(i)] for i in range(count)]
-    return [start(*one, cwd=folder, merged=True) for start, one in zip(begin, each, strict=False)]
-
-
-@pytest.mark.slow
-def test_several_processes_give_the_numbers_of_one(tmp_path):
-    """Three, reduced; two write trajectories in the test of one that dies."""
-    arguments = [
-        "--seeds",
-        "60",
-        "--duration",
-        "1",
-        "--chunk",
-        "8",
-        "--reduce",
-        "--out",
-        "runs.zarr",
-    ]
-    workers = started(3, arguments, tmp_path)
-    told = [ended(worker)[0] for worker in workers]
-    assert ["Written" in text for text in told] == [True, False, False]
-    found = xarray.open_zarr(tmp_path / "runs.zarr")
-    assert found.attrs["complete"]
-    task, options = jm.load_preset("zagrodny-slifkin"), {"seeds": 60, "duration": 1.0, "chunk": 8}
-    whole = jm.ensemble(task, jax.random.key(0), reduce=True, **options)
-    close(found["mean"], whole.mean)
-    close(found["variance"], whole.variance)
-    np.testing.assert_allclose(found["quantiles"], whole.quantile, rtol=1e-6)
-
-
-ALONE = """
-import sys, jax, jaxmuscle as jm
-from jaxmuscle.ensembles._processes import join
-rank, port = int(sys.argv[1]), sys.argv[2]
-join(f"127.0.0.1:{port}", 2, rank)
-jax.devices()  # JAX itself waits for all here
-if rank == 0:
-    found = jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=12, duration=1.0)
-    print(found.output.shape, flush=True)
-"""
-
-
-@pytest.mark.slow
-def test_one_of_several_processes_simulates_alone_in_memory():
-    """Only a store is shared: who has none must not wait for the others."""
-    port = str(free_port())
-    workers = [python(ALONE, str(rank), port) for rank in range(2)]
-    assert [ended(worker)[0].strip() for worker in workers] == ["(12, 101)", ""]
-
-
 def wait_for(condition, seconds=120.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.02)
-
-
-@pytest.mark.slow
-def test_a_process_that_dies_stops_the_others_and_loses_nothing(tmp_path):
-    arguments = ["--seeds", "1600", "--duration", "1", "--chunk", "8", "--out", "runs.zarr"]
-    workers = started(2, arguments, tmp_path)
-    path = tmp_path / "runs.zarr"
-    wait_for((path / "progress" / "chunk-00000001.json").exists)  # process 1 has the odd chunks
-    workers[1].kill()
-    told, _ = ended(workers[0], 1)
-    ended(workers[1], -signal.SIGKILL)
-    assert "another process of this run died or stopped" in told and "--resume" in told
-    assert xarray.open_zarr(path).attrs["complete"] is False
-    ended(command("ensemble", "zagrodny-slifkin", *arguments, "--resume", cwd=tmp_path))
-    whole = jm.ensemble(
-        jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=1600, control=False, **SHORT
-    )
-    close(xarray.open_zarr(path)["P_w"], whole.output)
-
-
-@pytest.mark.slow
-def test_processes_fail_together(tmp_path):
-    """What process 0 finds wrong is said by all, in one line. Process 0 is no fork."""
-    (tmp_path / "runs.zarr").write_text("a file")
-    workers = started(
-        2,
-        ["--seeds", "8", "--duration", "1", "--out", "runs.zarr"],
-        tmp_path,
-        (true_command, command),
-    )
-    told = [ended(worker, 2)[0] for worker in workers]
-    assert all("error: runs.zarr: exists already" in text for text in told)
 
 
 RUN = """
@@ -816,8 +716,8 @@ def test_kill_9_four_times(tmp_path, kind):
 def amount(path):
     """How much is in a store that is not complete."""
     size = 0
-    for file in (path / "progress").glob("[!.]*"):
-        # a resumed run removes the tallies that it has taken over
+    for file in [*(path / "progress").glob("[!.]*"), *(path / "F_ext" / "c").glob("*/0")]:
+        # the end of a run removes the tally
         with contextlib.suppress(FileNotFoundError):
             size += file.stat().st_size
     return size
@@ -911,7 +811,6 @@ def test_the_command_speaks_json(tmp_path):
             ["--seeds", "8", "--reduce", "--states"],
             "--states keeps trajectories and --reduce throws them away",
         ),
-        (["--seeds", "8", "--processes", "2"], "belong together"),
         (["--seeds", "8", "--duration", "0.0031"], "duration = 0.0031 s is not a whole number"),
         # the rest is typer's
         (["--seeds", "8", "--threads", "0"], "Invalid value for '--threads'"),

@@ -133,7 +133,7 @@ def test_public_methods_are_documented(name):
 
 FUNCTIONS = [name for name in NAMES if inspect.isroutine(operator.attrgetter(name)(jm))]
 # docs/ensembles.md
-OF_PROCESSES = {"ensembles.join", "ensembles.launched", "ensembles.leave", "ensembles.measure"}
+OF_COMMANDS = {"ensembles.measure"}
 RUN = (
     "list_",
     "load_target",
@@ -160,7 +160,7 @@ def examples(name):
                 yield code
 
 
-@pytest.mark.parametrize("name", sorted(set(FUNCTIONS) - OF_PROCESSES))
+@pytest.mark.parametrize("name", sorted(set(FUNCTIONS) - OF_COMMANDS))
 def test_function_has_an_example(name, tmp_path, monkeypatch):
     """Those that need neither a file of the reader's nor a fit are run."""
     code = "\n".join(examples(name))

@@ -38,9 +38,5 @@ class ResultError(ValueError):
     """A file that is not a fit result; the message names it and the reason."""
 
 
-class ProcessLostError(RuntimeError):
-    """Another process of the run died or stopped."""
-
-
 class WorkersLostError(RuntimeError):
     """The workers of an executor, or their scheduler, are lost."""

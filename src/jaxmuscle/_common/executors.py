@@ -5,9 +5,9 @@ import contextlib
 import itertools
 import logging
 import queue
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 
@@ -35,7 +35,10 @@ class DaskClient(Protocol):
     def scheduler_info(self) -> dict[str, Any]: ...
 
 
-AnyExecutor = Executor | DaskClient
+if TYPE_CHECKING:
+    AnyExecutor = Executor | DaskClient
+else:
+    AnyExecutor = Any  # checked by `pool_of`, with a sentence
 
 
 class Block(NamedTuple, Generic[Item, Made]):
@@ -73,11 +76,14 @@ def pool_of(executor: AnyExecutor) -> Executor:
 
 
 def results_of(
-    executor: AnyExecutor, work: Callable[[Item], Made], items: Iterable[Item]
-) -> Iterator[tuple[Item, Made]]:
+    executor: AnyExecutor,
+    work: Callable[[Item], Made],
+    items: Iterable[Item],
+    window: int = WINDOW,
+) -> Generator[tuple[Item, Made], None, None]:
     """Every item and `work(item)`, in the order of the items.
 
-    At most `WINDOW` items are under way. `work` may be done twice for an item, where a worker is
+    At most `window` items are under way. `work` may be done twice for an item, where a worker is
     lost, so it must do no harm. A result is given up as soon as it is here: Dask computes again
     what a lost worker had and somebody still wants.
 
@@ -91,7 +97,7 @@ def results_of(
     wanted = next(turn)
     try:
         while True:
-            room = WINDOW - len(under_way) - len(waiting)
+            room = window - len(under_way) - len(waiting)
             for number, item in itertools.islice(rest, room):
                 future = _submitted(pool, call, item)
                 under_way[future] = number, item

@@ -16,7 +16,7 @@ from .analyse import analyse
 from .compare import compare
 from .console import out, plain, record, reporting
 from .design import design
-from .ensemble import ensemble, merge
+from .ensemble import ensemble
 from .explore import explore
 from .fit import fit
 from .identifiability import identifiability
@@ -34,7 +34,6 @@ app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", pretty_exce
 app.command()(fit)
 app.command()(simulate)
 app.command()(ensemble)
-app.command()(merge)
 app.command()(analyse)
 app.command("analyze", hidden=True)(analyse)
 app.command()(steadiness)

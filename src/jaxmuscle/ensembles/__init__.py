@@ -1,6 +1,6 @@
-"""Many simulations: chunks, stores on disk, sweeps, several processes, running moments.
+"""Many simulations: chunks, stores on disk, sweeps, running moments, workers on any machines.
 
-Seed i is the same path in whatever chunk or process it is computed.
+Seed i is the same path in whatever chunk or worker it is computed.
 """
 
 import lazy_loader

@@ -1,7 +1,7 @@
 """Ensembles: many seeds, many points, in memory, reduced while they run, or streamed to a store."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxmuscle._common.arguments import count, is_real
 from jaxmuscle._common.arrays import all_concrete, as_arrays
+from jaxmuscle._common.executors import AnyExecutor
 from jaxmuscle._common.keys import key_of, seeds_of
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import listed
@@ -21,22 +22,12 @@ from jaxmuscle.response._linearised import linearise
 from jaxmuscle.simulation._simulate import DT, DURATION, require_finite, trajectories
 from jaxmuscle.simulation._trajectory import Trajectory
 
-from ._layout import (
-    Layout,
-    Pace,
-    Watch,
-    companions,
-    covers_window,
-    cut_of,
-    laid_out,
-    plan_of,
-    run_chunks,
-)
-from ._parts import Part, PartReport
-from ._places import place_of
+from ._chunks import Clock, Found, Known, Pace, Watch, block_results
+from ._layout import Chunk, Layout, companions, covers_window, cut_of, laid_out, plan_of
 from ._run import reduced, stored
 from ._running_moments import LEVELS
 from ._settings import begun_with
+from ._store import folder_of
 from ._summary import EnsembleSummary
 from ._sweep import Population, Sweep
 
@@ -50,15 +41,24 @@ AT_ONCE = 16  # seeds of a fit that a core simulates side by side
 Progress = bool | Callable[[str, float], None] | Watch
 
 
+Tasks = AbstractTask | Sweep | Sequence[AbstractTask]
+
+
 @overload
 def ensemble(
-    task: AbstractTask,
-    key: Key,
-    *,
-    seeds: Seeds,
-    reduce: Literal[False] = ...,
-    store: None = ...,
-    **given: Any,
+    task: Tasks, key: Key, *, seeds: Seeds, reduce: Literal[True] | tuple[float, ...], **given: Any
+) -> EnsembleSummary: ...
+
+
+@overload
+def ensemble(
+    task: Tasks, key: Key, *, seeds: Seeds, store: str | Path, **given: Any
+) -> "xarray.Dataset": ...
+
+
+@overload
+def ensemble(
+    task: AbstractTask, key: Key, *, seeds: Seeds, reduce: Literal[False] = ..., **given: Any
 ) -> Trajectory: ...
 
 
@@ -69,52 +69,12 @@ def ensemble(
     *,
     seeds: Seeds,
     reduce: Literal[False] = ...,
-    store: None = ...,
     **given: Any,
 ) -> Population: ...
 
 
-@overload
-def ensemble(
-    task: AbstractTask | Sweep | Sequence[AbstractTask],
-    key: Key,
-    *,
-    seeds: Seeds,
-    store: str | Path,
-    part: tuple[int, int],
-    reduce: bool | tuple[float, ...] = ...,
-    **given: Any,
-) -> PartReport: ...
-
-
-@overload
-def ensemble(
-    task: AbstractTask | Sweep | Sequence[AbstractTask],
-    key: Key,
-    *,
-    seeds: Seeds,
-    reduce: Literal[True] | tuple[float, ...],
-    store: str | Path | None = ...,
-    part: None = ...,
-    **given: Any,
-) -> EnsembleSummary: ...
-
-
-@overload
-def ensemble(
-    task: AbstractTask | Sweep | Sequence[AbstractTask],
-    key: Key,
-    *,
-    seeds: Seeds,
-    store: str | Path,
-    reduce: Literal[False] = ...,
-    part: None = ...,
-    **given: Any,
-) -> "xarray.Dataset": ...
-
-
 def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsistentOverload]
-    task: AbstractTask | Sweep | Sequence[AbstractTask],
+    task: Tasks,
     key: Key,
     *,
     seeds: Seeds,
@@ -131,7 +91,7 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
     resume: bool = False,
     overwrite: bool = False,
     states: bool = False,
-    part: tuple[int, int] | None = None,
+    executor: AnyExecutor | None = None,
     increments: str = "gaussian",
     generator: str = "hash",
     threads: int | None = None,
@@ -142,9 +102,9 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
         runs = jm.ensemble(jm.Isometric(), jax.random.key(0), seeds=100)
         runs.spectrum().plot()
 
-    Seed i is `simulate(..., seed=i)`, whatever the chunk, the devices or the number of processes.
-    Chunks run on all GPUs of this process. Without a GPU they run on all cores of the CPU that the
-    process may use, or on so many as `threads` says.
+    Seed i is `simulate(..., seed=i)`, whatever the chunk, the devices or the workers. Chunks run on
+    all GPUs of this process. Without a GPU they run on all cores of the CPU that the process may
+    use, or on so many as `threads` says. With `executor` its workers do them, on any machines.
 
     **Arguments:**
 
@@ -159,16 +119,13 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
     has a stable equilibrium whose transients have decayed there.
 
     `reduce`, True or the levels of the quantiles, keeps moments, quantiles and the mean spectrum
-    only: memory does not depend on the number of seeds. `store`, the folder or URL (fsspec's, as
-    s3://...) of a zarr store, streams every chunk there (`states` with it), or what is reduced from
-    time to time; with `resume` an interrupted one is continued, with `overwrite` an older ensemble
-    is replaced. Under `jax.distributed` all processes make the same call and share its chunks; all
-    must see the store.
+    only: memory does not depend on the number of seeds. `store`, the folder of a zarr store,
+    streams every chunk there (`states` with it), or what is reduced from time to time; with
+    `resume` an interrupted one is continued, with `overwrite` an older ensemble is replaced.
 
-    `part=(i, n)` computes the i-th (from 1) of n parts of a store. The parts are processes that do
-    not know of each other. They may run in any order or at once. One that was killed, or is
-    repeated, goes on where it was, `resume` or not. In the end `jaxmuscle.ensembles.merge(store)`
-    makes one ensemble of all.
+    `executor`, any of `concurrent.futures` (of processes: those that are spawned) or a client of
+    Dask, shares the chunks among its workers. The result is the same to the last bit, however many
+    they are. All must see the store's folder if trajectories are written there.
 
     `increments="weak"` takes numbers of 256 values with the first seven moments of a normal instead
     of normals, which is faster. Expectations keep their order in dt, paths mean nothing: with
@@ -176,14 +133,12 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
     `docs/engine.md`) or "threefry" (JAX's own, slower), makes other noise.
 
     **Returns:** a `Trajectory`, of a sweep a `Population`; with `reduce` an `EnsembleSummary`; with
-    `store` alone the opened `xarray.Dataset` (dimensions (point,) seed, time, frequency); with
-    `part` always a `PartReport`. A merged store is opened by the same call without `part`, with
-    `resume`.
+    `store` alone the opened `xarray.Dataset` (dimensions (point,) seed, time, frequency).
 
     **Raises:** as `simulate`: what does not stay finite is an error that names every such seed;
     with `reduce` or `store` it is left out, or NaN, and listed in `failed`. `ValueError` for a
     store that exists already or was made with other settings; `OSError` for one that cannot be
-    written; `ProcessLostError` if another process died.
+    written; `WorkersLostError` if the workers of the executor, or their scheduler, are lost.
     """
     if not isinstance(task, Sweep):
         for each in task if isinstance(task, list | tuple) else [task]:
@@ -191,17 +146,13 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
     if not isinstance(task, AbstractTask | Sweep):
         task = Sweep.of(task)
     key, numbers = key_of(key), seeds_of(seeds)
-    _check_options(store, resume, overwrite, states, control, chunk, threads)
-    levels, draws = _levels(reduce), Draws.of(generator, increments)
-    if draws.increments == "weak":
-        _check_weak(levels)
-    place = None if store is None else place_of(store)
-    mine = (
-        None if part is None else Part.checked(part, store=store is not None, overwrite=overwrite)
-    )
+    path = None if store is None else folder_of(store)
+    _check_options(path, resume, overwrite, states, control, chunk, threads, executor)
+    draws = Draws.of(generator, increments)
+    levels = _levels(reduce, weak=draws.increments == "weak")
     plan = plan_of(task, duration, dt, rate, substeps, sampling)
     if not all_concrete((task, key)):
-        if isinstance(task, Sweep) or levels or store is not None:
+        if isinstance(task, Sweep) or levels or path is not None:
             raise ValueError(
                 "under a JAX transformation an ensemble can be of one task, in memory: no sweep,"
                 " reduce or store"
@@ -209,20 +160,11 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
         linear = LinearTask.of(as_arrays(task), linearise(task)) if control else None
         return trajectories(task, linear, key, jnp.asarray(np.asarray(numbers)), plan, draws=draws)
     linear = companions(task, duration, control)
-    kept = levels is not None or store is not None
+    kept = levels is not None or path is not None
     spectrum = kept and covers_window(plan, task)
     whole = not kept or (states and levels is None)
-    again = chunk is None and (resume or mine is not None)
-    cut = begun_with(place) if place is not None and again else None
-    if cut is None:
-        cut = cut_of(
-            task,
-            len(numbers),
-            plan,
-            chunk,
-            shared=place is not None,
-            parts=None if mine is None else mine.of,
-        )
+    begun = None if path is None or not resume or chunk is not None else begun_with(path)
+    cut = begun or cut_of(task, len(numbers), plan, chunk)
     layout = laid_out(
         task,
         key,
@@ -235,15 +177,13 @@ def ensemble(  # noqa: PLR0913 (public options)  # pyright: ignore[reportInconsi
         draws=draws,
         threads=threads,
     )
-    begin = (
-        "part" if mine is not None else "resume" if resume else "overwrite" if overwrite else "new"
-    )
+    begin = "resume" if resume else "overwrite" if overwrite else "new"
     with telling(progress, layout) as tell:
         if levels is not None:
-            return reduced(layout, levels, place, tell, begin=begin, part=mine)
-        if place is not None:
-            return stored(layout, place, tell, begin=begin, states=states, part=mine)
-        return _in_memory(layout, tell)
+            return reduced(layout, levels, path, tell, executor, begin=begin)
+        if path is not None:
+            return stored(layout, path, tell, executor, begin=begin, states=states)
+        return _in_memory(layout, tell, executor)
 
 
 def runs_for_means(task: AbstractTask, key: Key, seeds: int) -> Trajectory:
@@ -251,58 +191,49 @@ def runs_for_means(task: AbstractTask, key: Key, seeds: int) -> Trajectory:
 
     `AT_ONCE` of them at once: one program for any number, and each core of a CPU has some.
     """
-    plan = plan_of(task, DURATION, DT, None, None, None)
-    cut = cut_of(task, seeds, plan, AT_ONCE, shared=False)
-    linear = companions(task, DURATION, None)
-    layout = laid_out(
-        task,
-        key_of(key),
-        range(seeds),
-        plan,
-        linear,
-        cut=cut,
-        states=True,
-        spectrum=False,
-        draws=Draws(),
-        threads=None,
-    )
-    found = _in_memory(layout, lambda pace: None)
-    assert isinstance(found, Trajectory)
-    return found
+    return ensemble(task, key, seeds=seeds, chunk=AT_ONCE)
 
 
 def _check_options(
-    store: str | Path | None,
+    path: Path | None,
     resume: bool,
     overwrite: bool,
     states: bool,
     control: bool | None,
     chunk: int | None,
     threads: int | None,
+    executor: AnyExecutor | None,
 ) -> None:
     """Raise a `ValueError` for options that are wrong, alone or together."""
-    if store is not None and not isinstance(store, str | Path):
-        raise ValueError(f"store = {store!r}: give a path or a URL")
     if control is not None and not isinstance(control, bool):
         raise ValueError(f"control = {control!r}: give True, False, or None to let it be decided")
     if chunk is not None:
         count("chunk", chunk, 1)
     if threads is not None:
         count("threads", threads, 1, 1024)
+        if executor is not None:
+            raise ValueError(
+                f"threads = {threads} belongs to one process: leave it out where an executor works"
+            )
     if resume and overwrite:
         raise ValueError(
             "resume (--resume) continues a store, overwrite (--force) replaces it: give one of"
             " the two"
         )
-    if (resume or states) and store is None:
+    if (resume or states) and path is None:
         raise ValueError(
             f"{'resume' if resume else 'states'} = True belongs to a store: give store="
         )
 
 
-def _levels(reduce: bool | tuple[float, ...]) -> tuple[float, ...] | None:
+def _levels(reduce: bool | tuple[float, ...], *, weak: bool) -> tuple[float, ...] | None:
     """Levels of the quantiles, None if nothing is reduced."""
     if reduce is False:
+        if weak:
+            raise ValueError(
+                'increments = "weak" is for expectations, its paths mean nothing: give reduce=True'
+                " (--reduce)"
+            )
         return None
     levels = LEVELS if reduce is True else reduce
     if (
@@ -311,40 +242,43 @@ def _levels(reduce: bool | tuple[float, ...]) -> tuple[float, ...] | None:
         or not all(is_real(level) and 0 < level < 1 for level in levels)
     ):
         raise ValueError(f"reduce = {reduce}: levels of quantiles lie between 0 and 1")
+    if weak:
+        _require_near(levels)
     return tuple(sorted(map(float, levels)))
 
 
-def _check_weak(levels: tuple[float, ...] | None) -> None:
-    if levels is None:
-        raise ValueError(
-            'increments = "weak" is for expectations, its paths mean nothing: give reduce=True'
-            " (--reduce)"
-        )
+def _require_near(levels: Sequence[float]) -> None:
+    """Weak increments have no tails."""
     outside = [level for level in levels if not FURTHEST <= level <= 1 - FURTHEST]
     if outside:
         raise ValueError(
-            f'reduce = {levels} with increments = "weak": quantiles beyond {FURTHEST:g} and'
+            f'reduce = {tuple(levels)} with increments = "weak": quantiles beyond {FURTHEST:g} and'
             f" {1 - FURTHEST:g} depend on the tails of single increments ({listed(outside)}): leave"
             " increments out"
         )
 
 
-def _in_memory(layout: Layout, tell: Callable[[Pace], None]) -> Trajectory | Population:
-    """Everything, joined; a sweep point by point."""
+def everything(
+    layout: Layout, simulated: Iterable[tuple[Chunk, Found]], known: Known
+) -> list[Found]:
+    """All that is kept of a block's chunks in memory."""
     names = ("states", "output", *(("linear",) if layout.linear is not None else ()))
-    parts: list[dict[str, list[np.ndarray]]] = [
-        {name: [] for name in names} for _ in range(layout.points)
-    ]
-    for chunk, found in run_chunks(layout, range(layout.chunks), tell):
-        for row, point in enumerate(chunk.points):
-            for name in names:
-                parts[point][name].append(found[name][row])
+    return [{name: found[name] for name in names} for _, found in simulated]
+
+
+def _in_memory(
+    layout: Layout, tell: Callable[[Pace], None], executor: AnyExecutor | None
+) -> Trajectory | Population:
+    """Everything, joined; a sweep point by point."""
+    numbers = range(layout.chunks)
+    results = block_results(layout, numbers, everything, executor, Clock(layout, numbers, tell))
+    chunks = [found for _, made in results for found in made]
     grid, plan, seeds = layout.plan.grid, layout.plan, np.asarray(layout.seeds)
     members = []
-    for point, part in enumerate(parts):
-        joined = {
-            name: rows[0] if len(rows) == 1 else np.concatenate(rows) for name, rows in part.items()
-        }
+    for point in range(layout.points):
+        first, row = divmod(point, layout.together)
+        own = chunks[first * layout.across : (first + 1) * layout.across]
+        joined = {name: np.concatenate([found[name][row] for found in own]) for name in own[0]}
         members.append(
             Trajectory(
                 layout.task_of(point),
@@ -358,7 +292,6 @@ def _in_memory(layout: Layout, tell: Callable[[Pace], None]) -> Trajectory | Pop
                 joined.get("linear"),
             )
         )
-        part.clear()
         require_finite(
             members[-1], f" at point {point} of the sweep" if isinstance(layout.task, Sweep) else ""
         )
@@ -370,6 +303,6 @@ def telling(progress: Progress, layout: Layout) -> Iterator[Callable[[Pace], Non
     """A bar, a function of (text, share), or silence."""
     if isinstance(progress, Watch):
         yield progress.tell
-    else:
-        with told(progress, f"simulating {layout.points * len(layout.seeds)} seeds") as tell:
-            yield lambda pace: tell(str(pace), pace.done / pace.total)
+        return
+    with told(progress, f"simulating {layout.points * len(layout.seeds)} seeds") as tell:
+        yield lambda pace: tell(str(pace), pace.done / pace.total)

@@ -7,19 +7,27 @@ import json
 import math
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import google_crc32c
 
 from jaxmuscle._common.errors import StoreError
 
-from ._places import ROOT, AbstractPlace
-
+ROOT = "zarr.json"  # a store is there once it has this file
 CHECKSUM = "checksum"
 SIZE = hashlib.sha256().digest_size
 CRC = 4  # bytes that zarr's codec crc32c adds to a chunk
 
 Document = dict[str, Any]
+
+
+def read(file: Path) -> bytes | None:
+    """The bytes of a file, None if there is none."""
+    try:
+        return file.read_bytes()
+    except FileNotFoundError:
+        return None
 
 
 def sealed(data: bytes) -> bytes:
@@ -47,7 +55,7 @@ def _digest(document: Document, names: list[str]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def require_intact(place: AbstractPlace, document: Document) -> None:
+def require_intact(path: Path, document: Document) -> None:
     """**Raises:** `StoreError` if the description of a store is not what was written."""
     try:
         made = json.loads(document["attributes"][CHECKSUM])
@@ -56,7 +64,7 @@ def require_intact(place: AbstractPlace, document: Document) -> None:
         intact = False
     if not intact:
         raise StoreError(
-            f"{place.name}: its description ({ROOT}) is damaged, or of an earlier version of"
+            f"{path}: its description ({ROOT}) is damaged, or of an earlier version of"
             " jaxmuscle: its checksum is missing or wrong. Take a copy, or begin anew (--force,"
             " overwrite=True)"
         )
@@ -101,21 +109,11 @@ def keys_of_chunk(document: Document, number: int) -> list[str]:
     return keys
 
 
-def chunk_of_key(document: Document, key: str) -> int | None:
-    """The number of the chunk of the ensemble that fills a key; None if it is another key."""
-    name, _, place = key.partition("/c/")
-    grid = _of_seeds(document).get(name)
-    if grid is None or not place:
-        return None
-    *lead, column, _ = map(int, place.split("/"))
-    return (lead[0] if lead else 0) * len(grid[-2]) + column
-
-
-def damaged(place: AbstractPlace, keys: Iterable[str]) -> list[str]:
+def damaged(path: Path, keys: Iterable[str]) -> list[str]:
     """Those of these keys whose chunk is missing, or not what was written."""
     wanted = list(keys)
     with ThreadPoolExecutor() as pool:
-        good = pool.map(lambda key: _good(place.read(key)), wanted)
+        good = pool.map(lambda key: _good(read(path / key)), wanted)
         return [key for key, fine in zip(wanted, good, strict=True) if not fine]
 
 
@@ -125,13 +123,13 @@ def _good(chunk: bytes | None) -> bool:
     )
 
 
-def misdescribed(place: AbstractPlace, document: Document) -> list[str]:
+def misdescribed(path: Path, document: Document) -> list[str]:
     """Keys of descriptions of single arrays that are not the ones in the store's own
     description."""
     return [
         key
         for name, about in described(document).items()
-        if _parsed(place.read(key := f"{name}/{ROOT}")) != about
+        if _parsed(read(path / (key := f"{name}/{ROOT}"))) != about
     ]
 
 
@@ -142,19 +140,17 @@ def _parsed(data: bytes | None) -> Any:
         return None
 
 
-def others(document: Document) -> list[str]:
-    """The arrays of a store that do not have a chunk for each chunk of the ensemble."""
-    return [name for name in described(document) if name not in _of_seeds(document)]
+def computed_keys(document: Document) -> Iterator[str]:
+    """Keys of all chunks of the arrays that have one for each chunk of the ensemble."""
+    return (key for name in _of_seeds(document) for key in keys_of_array(document, name))
 
 
-def wrong(
-    place: AbstractPlace, document: Document, names: Iterable[str] | None = None
-) -> list[str]:
+def wrong(path: Path, document: Document, names: Iterable[str] | None = None) -> list[str]:
     """Keys of a store that are missing or damaged: of all arrays, or of these; descriptions
     always."""
     arrays = described(document) if names is None else names
-    return misdescribed(place, document) + damaged(
-        place, itertools.chain.from_iterable(keys_of_array(document, name) for name in arrays)
+    return misdescribed(path, document) + damaged(
+        path, itertools.chain.from_iterable(keys_of_array(document, name) for name in arrays)
     )
 
 

@@ -1,46 +1,62 @@
-"""Ensembles that outlive their process: reduced while they run, or streamed to a store, by one
-process or many."""
+"""Ensembles that are reduced while they run, or streamed to a store, by whoever works."""
 
 import contextlib
+import functools
+import io
+import itertools
+import json
+import logging
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
 
-from jaxmuscle._common.errors import SimulationError
+from jaxmuscle._common.errors import SimulationError, StoreError
+from jaxmuscle._common.executors import AnyExecutor, results_of
 from jaxmuscle.response._expected_moments import linear_spectrum
 
-from ._arrays import region_of, variables_of
-from ._layout import Chunk, Layout, Pace, run_chunks
-from ._mending import drop_damaged
-from ._opening import opened
-from ._parts import Part, PartReport, failed_in, finish
-from ._places import AbstractPlace
-from ._processes import meet, rank_and_count
+from ._arrays import parts_of, region_of, variables_of
+from ._chunks import Clock, Found, Known, Pace, block_results, blocks_of
+from ._integrity import (
+    computed_keys,
+    damaged,
+    in_words,
+    keys_of_chunk,
+    read,
+    sealed,
+    unsealed,
+)
+from ._layout import Chunk, Layout
+from ._opening import finish, opened, take_back
 from ._running_moments import (
     CELLS,
     ChunkMoments,
+    Edges,
     RunningMoments,
     add,
     count_cells,
+    edges_of,
     empty,
     moments,
-    set_cells,
 )
 from ._settings import about, identity
-from ._store import PARTS, Begin, Variable, chunk_log, ensemble_at, logged, write_region
-from ._summary import EnsembleSummary, summarised
-from ._tallies import (
-    Reduced,
-    generation_of,
-    read_tallies,
-    read_tally,
-    tally_key,
-    tally_keys,
-    write_tally,
+from ._store import (
+    PROGRESS,
+    SETTINGS,
+    Variable,
+    description_of,
+    read_arrays,
+    replace,
+    require_settings,
+    settle,
+    write_arrays,
+    write_region,
 )
+from ._summary import EnsembleSummary, computed, summarised
+from ._sweep import Sweep
 
 if TYPE_CHECKING:
     import xarray
@@ -48,239 +64,178 @@ if TYPE_CHECKING:
 
 KEEP_EVERY = 10.0  # seconds between two copies of a tally on disk
 KEEP_SHARE = 20  # and at least this many times what writing one took
+TALLY = f"{PROGRESS}/tally.npz"
+LOG = logging.getLogger("jaxmuscle")
 
 Tell = Callable[[Pace], None]
+Failed = list[list[int]]  # point and seed of what did not stay finite
+
+
+# Reduced
+
+
+class Reduced(NamedTuple):
+    """A tally of the first `chunks` chunks in the order of `stages`, and what failed in them."""
+
+    tally: RunningMoments
+    chunks: int
+    failed: Failed
+
+
+class Condensed(NamedTuple):
+    """What is left of a block: what each chunk adds to each of its points, how much of their output
+    lies in which cell, where the cells of points lie whose first chunk it has, and what failed."""
+
+    parts: list[list[ChunkMoments]]
+    cells: dict[int, np.ndarray]
+    edges: dict[int, Edges]
+    failed: Failed
 
 
 def reduced(
     layout: Layout,
     levels: tuple[float, ...],
-    place: AbstractPlace | None,
+    path: Path | None,
     tell: Tell,
+    executor: AnyExecutor | None,
     *,
-    begin: Begin = "new",
-    part: Part | None = None,
-) -> EnsembleSummary | PartReport:
+    begin: str,
+) -> EnsembleSummary:
     """Moments, quantiles and the mean spectrum of all chunks; kept in a store from time to time if
-    there is one.
-
-    Of one part its chunks only, whose tally stays in the store until it is merged.
-    """
-    identified = identity(layout, part, {"kind": "reduced", "quantiles": list(levels)})
+    there is one."""
     values = layout.time.size + (2 * layout.bins + 1 if layout.bins else 0)
-
-    def nothing() -> Reduced:
-        tally = empty(layout.points, values, layout.time.size, len(levels), whole=layout.whole)
-        return Reduced(tally, frozenset(), [])
-
-    blank = _summary(layout, levels, nothing())
-    if place is None:
-        found = _reduce(layout, levels, nothing(), range(layout.chunks), tell, lambda found: None)
+    tally = empty(layout.points, values, layout.time.size, len(levels), whole=layout.whole)
+    nothing = Reduced(tally, 0, [])
+    if path is None:
+        found = _reduce(layout, levels, nothing, tell, executor, lambda found: None)
         return _summary(layout, levels, found)
+    blank = _summary(layout, levels, nothing)
     known = {*blank.coordinates(), "power_expected"}
-    variables = {
-        name: Variable(
-            dims, array.shape, array.shape, array.dtype, units, array if name in known else None
-        )
-        for name, (dims, array, units) in blank.arrays().items()
-    }
-    attributes = blank.attributes() | identified
-    with opened(
-        layout, place, variables, blank.coordinates(), attributes, begin=begin, part=part
-    ) as left:
-        if part is not None:
-            failed = (
-                _reduce_part(layout, levels, place, part, tell, nothing)
-                if left
-                else failed_in(place)
-            )
-            return _report(layout, part, failed, complete=not left)
-        if left:
-            _reduce_all(layout, levels, place, tell, nothing)
-            _finished(layout, place)
-        # Before the lock is given back: whoever overwrites the store could come in between.
-        return _loaded(place, blank)
-
-
-def _finished(layout: Layout, place: AbstractPlace) -> None:
-    """Process 0 makes the store complete, once all are done."""
-    if rank_and_count()[0] == 0:
-        finish(place, layout.chunks)
-    meet()
-
-
-def _reduce_all(
-    layout: Layout,
-    levels: tuple[float, ...],
-    place: AbstractPlace,
-    tell: Tell,
-    nothing: Callable[[], Reduced],
-) -> None:
-    """All that is left; of a store made in parts, which was damaged, part by part, so that the
-    numbers are the same."""
-    parts = ensemble_at(place).get(PARTS)
-    if parts is None:
-        return _share_tallies(layout, levels, place, tell, nothing)
-    rank, count = rank_and_count()
-    for number in range(1, parts + 1)[rank::count]:
-        _reduce_part(layout, levels, place, Part(number, parts), tell, nothing)
-    meet()
-
-
-def _share_tallies(
-    layout: Layout,
-    levels: tuple[float, ...],
-    place: AbstractPlace,
-    tell: Tell,
-    nothing: Callable[[], Reduced],
-) -> None:
-    """Every process reduces its share of what no tally in the store has yet; process 0 takes over
-    those there are."""
-    rank, count = rank_and_count()
-    base, old = read_tallies(place) or nothing(), tally_keys(place)
-    todo = [n for n in range(layout.chunks) if n not in base.chunks][rank::count]
-    key = tally_key(1 + max(map(generation_of, old), default=0), rank)
-    meet()  # all know what is left before anybody adds to it
-    if rank == 0 and old:
-        write_tally(place, key, base)
-        place.remove(*old)
-    found = _reduce(
-        layout,
-        levels,
-        base if rank == 0 else nothing(),
-        todo,
-        tell,
-        lambda found: write_tally(place, key, found),
+    variables = {name: Variable.whole(*given) for name, given in blank.arrays().items()}
+    variables |= {n: v._replace(values=None) for n, v in variables.items() if n not in known}
+    attributes = blank.attributes() | identity(
+        layout, {"kind": "reduced", "quantiles": list(levels)}
     )
-    write_tally(place, key, found)
-    meet()
+    with opened(path, variables, blank.coordinates(), attributes, begin=begin) as left:
+        if left:
+            kept = _read_tally(path) or nothing
+            save = functools.partial(_write_tally, path)
+            found = _reduce(layout, levels, kept, tell, executor, save)
+            arrays = _summary(layout, levels, found).arrays()
+            write_arrays(path, {name: arrays[name][1] for name in arrays if name not in known})
+            finish(path, found.failed)
+        # Before the lock is given back: whoever overwrites the store could come in between.
+        return _loaded(layout, levels, path, blank.arrays())
 
 
-def _reduce_part(
-    layout: Layout,
-    levels: tuple[float, ...],
-    place: AbstractPlace,
-    part: Part,
-    tell: Tell,
-    nothing: Callable[[], Reduced],
-) -> list[list[int]]:
-    """One part goes on with its own tally, and no other process writes that; the (point, seed) that
-    failed."""
-    key = tally_key(0, part.number)
-    base = read_tally(place, key) or nothing()
-    todo = [n for n in part.chunks(layout.chunks) if n not in base.chunks]
-    if todo:
-        base = _reduce(
-            layout, levels, base, todo, tell, lambda found: write_tally(place, key, found)
-        )
-        write_tally(place, key, base)
-    return base.failed
+def stages(layout: Layout) -> tuple[Sequence[int], Sequence[int]]:
+    """The first chunks of all points, which say where their cells lie; then the others."""
+    numbers = range(layout.chunks)
+    if layout.whole:
+        return numbers, ()
+    return numbers[:: layout.across], [n for n in numbers if n % layout.across]
 
 
 def _reduce(
     layout: Layout,
     levels: tuple[float, ...],
     found: Reduced,
-    numbers: Any,
     tell: Tell,
+    executor: AnyExecutor | None,
     save: Callable[[Reduced], None],
 ) -> Reduced:
-    """Chunks into a tally, which starts as `found`; saved from time to time, and when
-    interrupted."""
-    tally, chunks, failed = found.tally, set(found.chunks), list(found.failed)
-    known = np.flatnonzero(~np.isnan(tally.low).any(axis=1))
-    edges: dict[int, Edges] = {int(point): (tally.low[point], tally.high[point]) for point in known}
-    keep, adding = _keeper(save), False
-
-    def condensed(chunk: Chunk, result: dict[str, np.ndarray]) -> Condensed:
-        """On the thread that has simulated the chunk."""
-        each = [
-            _moments(layout, levels, result, row, edges.get(point))
-            for row, point in enumerate(chunk.points)
-        ]
-        return Condensed(each, _failed(layout, chunk, result), result["output"], result["finite"])
-
+    """The chunks that `found` does not have yet are added to it, in the order of `stages`, whoever
+    computes them; saved from time to time, and when interrupted."""
+    first, others = stages(layout)
+    todo = first[found.chunks :], others[max(0, found.chunks - len(first)) :]
+    clock, keep = Clock(layout, [*todo[0], *todo[1]], tell), _keeper(save)
+    outputs: list[np.ndarray] = []  # of a point of which not all chunks are here
+    adding = False
     try:
-        with contextlib.closing(run_chunks(layout, numbers, tell, condensed)) as results:
-            for chunk, more in results:
-                adding = True
-                _add_chunk(layout, tally, edges, chunk, more)
-                failed += more.failed
-                chunks.add(chunk.number)
-                adding = False
-                keep(Reduced(tally, frozenset(chunks), failed))
+        for numbers in todo:
+            low, high = found.tally.low, found.tally.high
+            edges = {
+                int(i): (low[i], high[i]) for i in np.flatnonzero(np.isfinite(low).all(axis=1))
+            }
+            results = block_results(layout, numbers, condensed, executor, clock, edges)
+            with contextlib.closing(results):
+                for part, more in results:
+                    adding = True
+                    _add_block(layout, levels, found.tally, outputs, part, more)
+                    found.failed.extend(more.failed)
+                    found = found._replace(chunks=found.chunks + len(part))
+                    adding = bool(outputs)
+                    if not adding:
+                        keep(found)
     except KeyboardInterrupt:
-        if not adding:  # else the tally holds a part of a chunk: what was saved last stays
-            save(Reduced(tally, frozenset(chunks), failed))
+        if not adding:  # else the tally holds a part of something: what was saved last stays
+            save(found)
         raise
-    return Reduced(tally, frozenset(chunks), failed)
+    return found
 
 
-Edges = tuple[np.ndarray, np.ndarray]
-
-
-def _add_chunk(
-    layout: Layout, tally: RunningMoments, edges: dict[int, Edges], chunk: Chunk, more: "Condensed"
-) -> None:
-    """One chunk into the tally. The first one of a point says where the cells of the point lie."""
-    for row, point in enumerate(chunk.points):
-        part = more.moments[row]
-        if part.cells is None and not layout.whole:  # the thread did not know yet where they lie
-            output = more.output[row][more.finite[row]]
-            if point not in edges:
-                set_cells(tally, point, _cell_sample(layout, chunk, point, output))
-                edges[point] = tally.low[point], tally.high[point]
-            part = part._replace(cells=count_cells(*edges[point], output))
-        add(tally, point, part)
-
-
-class Condensed(NamedTuple):
-    """What is left of a chunk: moments of every point, (point, seed) of what failed, and the
-    output, whose cells may have to be counted yet."""
-
-    moments: list[ChunkMoments]
-    failed: list[list[int]]
-    output: np.ndarray
-    finite: np.ndarray
-
-
-def _moments(
+def _add_block(
     layout: Layout,
     levels: tuple[float, ...],
-    result: dict[str, np.ndarray],
-    row: int,
-    edges: Edges | None,
-) -> ChunkMoments:
-    """Of one point of a chunk; its cells are counted if their `edges` are known."""
-    finite = result["finite"][row]
-    stayed = slice(None) if finite.all() else finite  # a slice copies nothing
-    output = result["output"][row][stayed]
-    found = moments(_rows(layout, result, row)[stayed])
-    if layout.whole:
-        return found._replace(exact=np.quantile(output, levels, axis=0) if len(output) else None)
-    return found if edges is None else found._replace(cells=count_cells(*edges, output))
+    tally: RunningMoments,
+    outputs: list[np.ndarray],
+    part: Sequence[int],
+    more: Condensed,
+) -> None:
+    """A block into the tally, chunk by chunk, so that sums do not depend on the blocks."""
+    for number, moments_of in zip(part, more.parts, strict=True):
+        chunk = layout.chunk(number)
+        for point, piece in zip(chunk.points, moments_of, strict=True):
+            add(tally, point, piece)
+            if piece.output is not None:
+                outputs.append(piece.output)
+                if chunk.seeds.stop == len(layout.seeds):
+                    together = np.concatenate(outputs)
+                    if len(together):
+                        tally.exact[point] = np.quantile(together, levels, axis=0)
+                    outputs.clear()
+    for point, (low, high) in more.edges.items():
+        tally.low[point], tally.high[point] = low, high
+    for point, cells in more.cells.items():
+        tally.cells[point] += cells
 
 
-def _failed(layout: Layout, chunk: Chunk, found: dict[str, np.ndarray]) -> list[list[int]]:
-    """Point and seed of what did not stay finite."""
-    return [
-        [chunk.points[i], int(layout.seeds[chunk.seeds[j]])]
-        for i, j in np.argwhere(~found["finite"])
-    ]
+def condensed(layout: Layout, simulated: Iterable[tuple[Chunk, Found]], edges: Known) -> Condensed:
+    """What is left of a block of chunks, by whoever has simulated them."""
+    made = Condensed([], {}, {}, [])
+    for chunk, found in simulated:
+        made.failed.extend(_failed(layout, chunk, found["finite"]))
+        made.parts.append([])
+        for row, point in enumerate(chunk.points):
+            finite = found["finite"][row]
+            stayed = slice(None) if finite.all() else finite  # a slice copies nothing
+            output = found["output"][row][stayed]
+            piece = moments(_rows(layout, found, row)[stayed])
+            if layout.whole:
+                piece = piece._replace(output=output)
+            else:
+                if point not in edges:
+                    made.edges[point] = _edges(point, output)
+                low, high = edges[point] if point in edges else made.edges[point]
+                counted = count_cells(low, high, output)
+                made.cells[point] = counted + made.cells.get(point, 0)
+            made.parts[-1].append(piece)
+    packed = {i: n.astype(np.min_scalar_type(n.max())) for i, n in made.cells.items()}
+    return made._replace(cells=packed)
 
 
-def _cell_sample(layout: Layout, chunk: Chunk, point: int, output: np.ndarray) -> np.ndarray:
-    """Output of the first chunk of a point, by which every process places its cells."""
-    first = layout.chunk_of(point, 0)
-    if chunk.number != first:
-        ((_, found),) = run_chunks(layout, [first], lambda pace: None)
-        output = found["output"][0][found["finite"][0]]
+def _edges(point: int, output: np.ndarray) -> Edges:
     if len(output) == 0:
         raise SimulationError(
             f"none of the first seeds of point {point} stayed finite: lower the noise amplitude"
             " or dt"
         )
-    return output
+    return edges_of(output)
+
+
+def _failed(layout: Layout, chunk: Chunk, finite: np.ndarray) -> Failed:
+    """Point and seed of what did not stay finite."""
+    return [[chunk.points[i], int(layout.seeds[chunk.seeds[j]])] for i, j in np.argwhere(~finite)]
 
 
 def _rows(layout: Layout, found: dict[str, np.ndarray], row: int) -> np.ndarray:
@@ -311,61 +266,25 @@ def _keeper(save: Callable[[Reduced], None]) -> Callable[[Reduced], None]:
     return keep
 
 
-def stored(
-    layout: Layout,
-    place: AbstractPlace,
-    tell: Tell,
-    *,
-    begin: Begin,
-    states: bool,
-    part: Part | None,
-) -> "xarray.Dataset | PartReport":
-    """Every trajectory, and its Welch power, to a store; opened when it is complete. Of one part
-    its chunks only."""
-    import xarray
-
-    attributes = about(layout) | identity(layout, part, {"kind": "trajectories", "states": states})
-    variables, coordinates = variables_of(layout, states=states)
-    own = range(layout.chunks) if part is None else part.chunks(layout.chunks)
-    with opened(layout, place, variables, coordinates, attributes, begin=begin, part=part) as left:
-        if left:
-            _write_chunks(layout, place, own, tell, states=states)
-        if part is not None:
-            there = logged(place, own)
-            failed = (
-                [entry for number in sorted(there) for entry in there[number]]
-                if left
-                else failed_in(place)
-            )
-            return _report(layout, part, failed, complete=not left)
-        if left:
-            _finished(layout, place)
-        return xarray.open_zarr(place.opened())
+def _write_tally(path: Path, found: Reduced) -> None:
+    """Keep what was reduced so far."""
+    data = io.BytesIO()
+    failed = np.array(found.failed, int).reshape(-1, 2)
+    np.savez(data, chunks=found.chunks, failed=failed, **found.tally._asdict())
+    replace(path, TALLY, sealed(data.getvalue()))
 
 
-def _write_chunks(
-    layout: Layout, place: AbstractPlace, own: range, tell: Tell, *, states: bool
-) -> None:
-    """Every process writes its share of those of these chunks that are not there, or are
-    damaged."""
-    rank, count = rank_and_count()
-    drop_damaged(place, logged(place, own[rank::count]))
-    meet()
-    done = logged(place, own)
-    meet()  # all know what is left before anybody adds to it
-    todo = [n for n in own if n not in done][rank::count]
-    with chunk_log(place) as log, contextlib.closing(run_chunks(layout, todo, tell)) as results:
-        for chunk, found in results:
-            region, parts = region_of(layout, chunk, found, states=states)
-            write_region(place, region, parts)
-            log(chunk.number, _failed(layout, chunk, found))
-    meet()
-
-
-def _report(layout: Layout, part: Part, failed: list[list[int]], *, complete: bool) -> PartReport:
-    chunks = [layout.chunk(number) for number in part.chunks(layout.chunks)]
-    seeds = sum(len(chunk.points) * len(chunk.seeds) for chunk in chunks)
-    return PartReport(*part, seeds, np.array(sorted(failed), int).reshape(-1, 2), complete)
+def _read_tally(path: Path) -> Reduced | None:
+    """What was kept, None if there is nothing; if it is damaged, that is said."""
+    kept = read(path / TALLY)
+    content = unsealed(kept or b"")
+    if content is None:
+        if kept:
+            LOG.warning("notice: %s: %s is damaged; what it held is computed again", path, TALLY)
+        return None
+    with np.load(io.BytesIO(content)) as data:
+        tally = RunningMoments(*(data[name] for name in RunningMoments._fields))
+        return Reduced(tally, int(data["chunks"]), data["failed"].tolist())
 
 
 def _summary(layout: Layout, levels: tuple[float, ...], found: Reduced) -> EnsembleSummary:
@@ -375,17 +294,123 @@ def _summary(layout: Layout, levels: tuple[float, ...], found: Reduced) -> Ensem
             linear_spectrum(layout.task_of(i), layout.recipe.settings) for i in range(layout.points)
         ]
         expected = np.stack([np.asarray(spectrum.power, float) for spectrum in spectra])
-    failed: Int[np.ndarray, "failed 2"] = np.array(sorted(found.failed), int).reshape(-1, 2)
-    described = about(layout) | ({} if layout.whole else {"cells_per_quantile": CELLS})
-    return summarised(layout, found.tally, levels, expected, failed, described)
+    arrays = computed(found.tally, levels, expected)
+    if not isinstance(layout.task, Sweep):
+        arrays = {name: values[0] for name, values in arrays.items()}
+    return _made(layout, levels, arrays, found.failed)
 
 
-def _loaded(place: AbstractPlace, blank: EnsembleSummary) -> EnsembleSummary:
+def _loaded(
+    layout: Layout, levels: tuple[float, ...], path: Path, names: Iterable[str]
+) -> EnsembleSummary:
     """The summary in a complete store."""
-    import zarr
+    failed = json.loads(description_of(path)["attributes"]["failed"])
+    return _made(layout, levels, read_arrays(path, names), failed)
 
-    group: Any = zarr.open_group(place.opened(), mode="r")
-    failed = np.array(failed_in(place), int).reshape(-1, 2)
-    return blank.with_arrays(
-        {name: np.asarray(group[name][...]) for name in blank.arrays()}, failed
+
+def _made(
+    layout: Layout, levels: tuple[float, ...], arrays: dict[str, np.ndarray], failed: Failed
+) -> EnsembleSummary:
+    described = about(layout) | ({} if layout.whole else {"cells_per_quantile": CELLS})
+    return summarised(
+        layout, levels, arrays, np.array(sorted(failed), int).reshape(-1, 2), described
     )
+
+
+# Stored
+
+
+class Home(NamedTuple):
+    """Where trajectories belong: a store of these settings, with states or not."""
+
+    path: Path
+    settings: str
+    states: bool
+
+    def write(
+        self, layout: Layout, simulated: Iterable[tuple[Chunk, Found]], known: Known
+    ) -> Failed:
+        """Write chunks; twice does no harm. The (point, seed) that failed in them."""
+        failed: Failed = []
+        for chunk, found in simulated:
+            # Nobody may have replaced it while this process was cut off from the one that began it.
+            require_settings(self.path, self.settings)
+            values = parts_of(layout, found, states=self.states)
+            write_region(self.path, region_of(layout, chunk), values)
+            failed += _failed(layout, chunk, found["finite"])
+        return failed
+
+    def look(self, layout: Layout, numbers: Sequence[int]) -> tuple[dict[int, Failed], list[str]]:
+        """Those of these chunks that are there as they were written, and the (point, seed) that
+        failed in them; files of others that are damaged."""
+        document, task = description_of(self.path), layout.task_of(0)
+        keys = {number: keys_of_chunk(document, number) for number in numbers}
+        bad = set(damaged(self.path, itertools.chain(*keys.values())))
+        names = {task.output_name, *(task.state_names if self.states else ())}
+        there: dict[int, Failed] = {}
+        for number in numbers:
+            if bad.isdisjoint(keys[number]):
+                chunk = layout.chunk(number)
+                values = read_arrays(self.path, names, region_of(layout, chunk)).values()
+                finite = np.all([np.isfinite(value).all(axis=-1) for value in values], axis=0)
+                shape = len(chunk.points), len(chunk.seeds)
+                there[number] = _failed(layout, chunk, finite.reshape(shape))
+        return there, [key for key in bad if (self.path / key).exists()]
+
+
+def stored(
+    layout: Layout,
+    path: Path,
+    tell: Tell,
+    executor: AnyExecutor | None,
+    *,
+    begin: str,
+    states: bool,
+) -> "xarray.Dataset":
+    """Every trajectory, and its Welch power, to a store; opened when it is complete."""
+    import xarray
+
+    attributes = about(layout) | identity(layout, {"kind": "trajectories", "states": states})
+    variables, coordinates = variables_of(layout, states=states)
+    with opened(path, variables, coordinates, attributes, begin=begin) as left:
+        if left:
+            # a worker has a folder of its own to begin at
+            place = path if executor is None else path.absolute()
+            home = Home(place, attributes[SETTINGS], states)
+            failed = {} if left == "new" else _there(layout, home, executor)
+            todo = [number for number in range(layout.chunks) if number not in failed]
+            results = block_results(layout, todo, home.write, executor, Clock(layout, todo, tell))
+            with contextlib.closing(results):
+                for part, more in results:
+                    failed[part[0]] = more
+            _settle(path)
+            finish(path, [entry for entries in failed.values() for entry in entries])
+        return xarray.open_zarr(path)
+
+
+def _there(layout: Layout, home: Home, executor: AnyExecutor | None) -> dict[int, Failed]:
+    """The chunks that are in a store as they were written, and the (point, seed) that failed in
+    them. What is damaged is taken back."""
+    there: dict[int, Failed] = {}
+    lost: list[str] = []
+    with ThreadPoolExecutor() as threads:
+        pool = threads if executor is None else executor
+        look = functools.partial(home.look, layout._replace(mesh=None))
+        for _, (some, bad) in results_of(pool, look, blocks_of(range(layout.chunks), pool)):
+            there |= some
+            lost += bad
+    if lost:
+        take_back(home.path, lost)
+    return there
+
+
+def _settle(path: Path) -> None:
+    """Wait until all chunks are on disk."""
+    keys = list(computed_keys(description_of(path)))
+    missing = [key for key in keys if not (path / key).exists()]
+    if missing:
+        raise StoreError(
+            f"{path}: {in_words(missing)} although all is done: is the folder the same for all"
+            " workers? Resume (--resume, resume=True) in a folder that they share"
+        )
+    settle(path, keys)

@@ -1,10 +1,10 @@
-"""Moments and quantiles of an ensemble that never is in memory: tallies of chunks, which merge in
-any order."""
+"""Moments and quantiles of an ensemble that never is in memory: a tally, to which chunks are
+added."""
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 CELLS = 512
@@ -17,7 +17,7 @@ class RunningMoments(NamedTuple):
 
     `seeds` that were finite; `mean` and `squares` (sums of squared deviations) of the values of a
     seed in a row: its output over time, then what else is averaged. Quantiles of the output are
-    `exact` where all seeds of a point came together; else its values are counted in `cells` between
+    `exact` where the seeds of a point are few; else its values are counted in `cells` between
     `low` and `high` of every sample (the outermost ones open), and NaN where no chunk of the point
     was seen.
     """
@@ -32,8 +32,7 @@ class RunningMoments(NamedTuple):
 
 
 def empty(points: int, values: int, samples: int, levels: int, *, whole: bool) -> RunningMoments:
-    """Of nothing; `whole` if every point comes in one piece, so that nothing has to be counted in
-    cells."""
+    """Of nothing; `whole` if quantiles are exact, so that nothing has to be counted in cells."""
     rows, cells = np.zeros((points, values)), 0 if whole else CELLS
     unknown = np.full((points, samples), np.nan)
     exact = np.full((points, levels, samples), np.nan)
@@ -49,14 +48,13 @@ def empty(points: int, values: int, samples: int, levels: int, *, whole: bool) -
 
 
 class ChunkMoments(NamedTuple):
-    """What a chunk adds to one point: finite `seeds`, `mean` and `squares` of their values, `cells`
-    of their output, and its `exact` quantiles where all seeds of the point came together."""
+    """What a chunk adds to one point: finite `seeds`, `mean` and `squares` of their values; its
+    `output`, where quantiles are exact."""
 
     seeds: int
     mean: Float[np.ndarray, " values"]
     squares: Float[np.ndarray, " values"]
-    cells: Int[np.ndarray, "samples cells"] | None = None
-    exact: Float[np.ndarray, "levels samples"] | None = None
+    output: Float[np.ndarray, "seeds samples"] | None = None
 
 
 def moments(rows: Float[np.ndarray, "seeds values"]) -> ChunkMoments:
@@ -76,10 +74,6 @@ def add(kept: RunningMoments, point: int, more: ChunkMoments) -> None:
             (more.seeds, more.mean, more.squares),
         )
         kept.seeds[point], kept.mean[point], kept.squares[point] = found
-        if more.exact is not None:
-            kept.exact[point] = more.exact
-        if more.cells is not None:
-            kept.cells[point] += more.cells
 
 
 def _merged(a: tuple, b: tuple) -> tuple:
@@ -91,13 +85,16 @@ def _merged(a: tuple, b: tuple) -> tuple:
     return count, a[1] + share * delta, a[2] + b[2] + delta**2 * (share * a[0])
 
 
-def set_cells(kept: RunningMoments, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
-    """Where the cells of a point lie, from the output of its first chunk."""
+Edges = tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]
+
+
+def edges_of(output: Float[np.ndarray, "seeds samples"]) -> Edges:
+    """Where the cells of a point begin and end, from the output of its first chunk."""
     mean, sd = output.mean(axis=0, dtype=float), output.std(axis=0, dtype=float)
     # what does not vary has its value for a quantile
     tiny = 1e-6 * np.abs(mean) + 1e3 * np.finfo(output.dtype).tiny
     reach = np.maximum(REACH * sd, 2 * np.abs(output - mean).max(axis=0)) + tiny
-    kept.low[point], kept.high[point] = mean - reach, mean + reach
+    return mean - reach, mean + reach
 
 
 def count_cells(
@@ -122,41 +119,21 @@ def count_cells(
     return found.reshape(samples, CELLS)
 
 
-def merged(first: RunningMoments, second: RunningMoments) -> RunningMoments:
-    """Both together; they must not share a chunk."""
-    a, b = ((t.seeds[:, None], t.mean, t.squares) for t in (first, second))
-    count, mean, squares = _merged(a, b)
-    exact, low, high = (
-        np.where(np.isnan(x), y, x) for x, y in zip(first[3:6], second[3:6], strict=True)
-    )
-    return RunningMoments(count[:, 0], mean, squares, exact, low, high, first.cells + second.cells)
-
-
 def quantiles(
     kept: RunningMoments, levels: tuple[float, ...]
 ) -> Float[np.ndarray, "points levels samples"]:
     """Quantiles of the output: exact, or linear within their cell (1/32 of a standard deviation);
     NaN in an open cell."""
     found = kept.exact.copy()
-    for point in np.flatnonzero(np.isnan(found).all(axis=(1, 2)) & (kept.seeds > 0)):
-        low, high, cells = kept.low[point], kept.high[point], kept.cells[point]
-        if cells.size:
-            for i, level in enumerate(levels):
-                found[point, i] = _quantile(low, (high - low) / CELLS, cells, level)
+    for point in np.flatnonzero((kept.cells.shape[2] > 0) & (kept.seeds > 0)):
+        low, cells = kept.low[point], kept.cells[point]
+        width = (kept.high[point] - low) / CELLS
+        upto, rows = np.cumsum(cells, axis=1), np.arange(len(cells))
+        for i, level in enumerate(levels):
+            wanted = level * upto[:, -1]
+            cell = np.minimum((upto < wanted[:, None]).sum(axis=1), CELLS - 1)
+            inside = np.maximum(cells[rows, cell], 1)
+            place = cell + (wanted - upto[rows, cell] + cells[rows, cell]) / inside
+            closed = (cell > 0) & (cell < CELLS - 1)
+            found[point, i] = np.where(closed, low + width * place, np.nan)
     return found
-
-
-def _quantile(
-    low: Float[np.ndarray, " samples"],
-    width: Float[np.ndarray, " samples"],
-    cells: Int[np.ndarray, "samples cells"],
-    level: float,
-) -> Float[np.ndarray, " samples"]:
-    wanted = level * cells.sum(axis=1)
-    upto = np.cumsum(cells, axis=1)
-    cell = np.minimum((upto < wanted[:, None]).sum(axis=1), CELLS - 1)
-    rows = np.arange(len(cells))
-    inside = np.maximum(cells[rows, cell], 1)
-    place = cell + (wanted - upto[rows, cell] + cells[rows, cell]) / inside
-    closed: Bool[np.ndarray, " samples"] = (cell > 0) & (cell < CELLS - 1)
-    return np.where(closed, low + width * place, np.nan)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,25 +14,24 @@ from jaxmuscle.model._stream import VERSION as STREAM
 from jaxmuscle.simulation._trajectory import run_attributes
 
 from ._layout import Cut, Layout
-from ._parts import Part
-from ._places import AbstractPlace
-from ._store import CHUNKS, PARTS, SETTINGS, ensemble_at
+from ._store import SETTINGS, description_of, is_there
 from ._sweep import Sweep
 
+CUT = "points at once", "chunk", "exact quantiles"
 
-def begun_with(place: AbstractPlace) -> Cut | None:
+
+def begun_with(path: Path) -> Cut | None:
     """How an existing store was cut, so that it can be resumed with other devices; None if there is
     none."""
-    if not place.exists():
+    if not is_there(path):
         return None
-    settings = json.loads(ensemble_at(place)[SETTINGS])
-    return Cut(settings["points at once"], settings["chunk"]) if "chunk" in settings else None
+    settings = json.loads(description_of(path)["attributes"][SETTINGS])
+    return Cut(*(settings.get(name, 1) for name in CUT))
 
 
-def identity(layout: Layout, part: Part | None, kind: dict[str, Any]) -> dict[str, Any]:
-    """Attributes by which a store is known again: all that its numbers depend on, and its parts."""
-    made = {SETTINGS: json.dumps(settings_of(layout) | kind)}
-    return made if part is None else made | {PARTS: part.of, CHUNKS: layout.chunks}
+def identity(layout: Layout, kind: dict[str, Any]) -> dict[str, Any]:
+    """The attribute by which a store is known again: all that its numbers depend on."""
+    return {SETTINGS: json.dumps(settings_of(layout) | kind)}
 
 
 def about(layout: Layout) -> dict[str, Any]:
@@ -71,8 +71,7 @@ def settings_of(layout: Layout) -> dict[str, Any]:
         "sampling": plan.sampling,
         "spectrum": task.settings.to_dict(),
         "control": layout.linear is not None,
-        "chunk": layout.width,
-        "points at once": layout.together,
+        **dict(zip(CUT, (layout.together, layout.width, layout.whole), strict=True)),
         "precision": str(jax.numpy.result_type(float)),
         "random numbers": layout.recipe.draws._asdict() | {"stream": STREAM},
         "versions": {name: versions()[name] for name in ("jaxmuscle", "jax")},

@@ -1,36 +1,25 @@
-"""Ensembles as zarr stores: written chunk by chunk by one or many processes, resumed, never
-complete before they are."""
+"""Ensembles as zarr stores: folders that are written chunk by chunk, and described in one place."""
 
 import contextlib
 import json
+import os
+import shutil
+import tempfile
 import threading
-import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxmuscle._common.errors import StoreError
+from jaxmuscle._common.files import replacing, to_disk
 
-from ._integrity import (
-    CHECKSUM,
-    Document,
-    keys_of_array,
-    keys_of_chunk,
-    require_intact,
-    sealed,
-    stamped,
-    unsealed,
-)
-from ._places import PROGRESS, ROOT, AbstractPlace, place_of
+from ._integrity import ROOT, Document, keys_of_array, require_intact, stamped
 
-Begin = Literal["new", "resume", "overwrite", "part"]
-SETTINGS, PARTS, CHUNKS = "settings", "parts", "chunks"
-DONE = f"{PROGRESS}/chunk-"
-LOG_EVERY = 1.0  # seconds between two moments at which chunks are on disk, and said to be
+SETTINGS = "settings"
+PROGRESS = "progress"
 OPENING = threading.Lock()  # of what changes settings of the whole process for a moment
 
 
@@ -45,25 +34,55 @@ class Variable(NamedTuple):
     units: str
     values: np.ndarray | None = None
 
+    @staticmethod
+    def whole(dims: tuple[str, ...], values: np.ndarray, units: str) -> "Variable":
+        """In one chunk."""
+        return Variable(dims, values.shape, values.shape, values.dtype, units, values)
+
+
+def folder_of(store: str | Path) -> Path:
+    """The folder of a store. **Raises:** `ValueError` for what is none."""
+    if not isinstance(store, str | Path) or "://" in str(store):
+        raise ValueError(f"store = {str(store)!r}: give the path of a folder")
+    return Path(store)
+
+
+def is_there(path: Path) -> bool:
+    """Whether a store, or something else, is there."""
+    return path.exists() or path.is_symlink()
+
 
 def create(
-    place: AbstractPlace,
+    path: Path,
     variables: Mapping[str, Variable],
     coordinates: list[str],
     attributes: dict[str, Any],
-) -> bool:
-    """A new, incomplete store, which appears whole or not at all; False if another process was
-    faster.
+) -> None:
+    """A new, incomplete store, which appears whole or not at all. For the only writer."""
+    with writing(path), _beside(path) as folder:
+        _build(folder / "new", variables, coordinates, attributes)
+        to_disk([folder, *folder.rglob("*")])
+        os.rename(folder / "new", path)
+        to_disk([path.parent])
 
-    **Raises:** `StoreError` if another has begun it with other settings.
-    """
-    with writing(place):
-        _refuse(
-            place, json.loads(place.claim(attributes[SETTINGS])), json.loads(attributes[SETTINGS])
-        )
-        with place.building() as folder:
-            _build(folder, variables, coordinates, attributes)
-            return place.put(folder)
+
+def clear(path: Path) -> None:
+    """Remove a store: in one step, since what is half removed has another name."""
+    with writing(path), _beside(path) as folder:
+        os.rename(path, folder / "old")
+
+
+@contextlib.contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    folder = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=path.parent))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _prefix(path: Path) -> str:
+    return f".{path.name}.new-"
 
 
 def _build(
@@ -108,13 +127,13 @@ def _build(
     (folder / ROOT).write_bytes(text_of(stamped(document)))
 
 
-def _arrays(opened: Any, names: Iterable[str]) -> dict[str, Any]:
+def _arrays(path: Path, names: Iterable[str]) -> dict[str, Any]:
     """Arrays of a store, which write every chunk: that one is not there must mean that it was
     lost."""
     import zarr
 
     with OPENING, zarr.config.set({"array.write_empty_chunks": True}):
-        group: Any = zarr.open_group(opened, mode="r+")
+        group: Any = zarr.open_group(path, mode="r+")
         return {name: group[name] for name in names}
 
 
@@ -124,7 +143,7 @@ def text_of(document: Document) -> bytes:
 
 
 @contextlib.contextmanager
-def writing(place: AbstractPlace) -> Iterator[None]:
+def writing(path: Path) -> Iterator[None]:
     """What the system refuses (a full disk, a folder without permission) becomes an error with the
     way on."""
     try:
@@ -133,117 +152,86 @@ def writing(place: AbstractPlace) -> Iterator[None]:
         remedy = (
             "what is complete stays: make room, or permission, and resume (--resume, resume=True)"
         )
-        raise OSError(error.errno, f"{error.strerror or error}; {remedy}", place.name) from error
+        raise OSError(error.errno, f"{error.strerror or error}; {remedy}", str(path)) from error
 
 
 def attributes_of(path: str | Path) -> dict[str, Any] | None:
-    """Attributes of the store at `path`, a folder or a URL; None if nothing is there.
+    """Attributes of the store at `path`, a folder; None if nothing is there.
 
         jm.ensembles.attributes_of("runs.zarr")["complete"]
 
-    **Raises:** `StoreError` if something else is there, or if the URL cannot be used.
+    **Raises:** `StoreError` if something else is there.
     """
-    place = place_of(path)
-    return attributes_at(place) if place.exists() else None
+    folder = folder_of(path)
+    return description_of(folder)["attributes"] if is_there(folder) else None
 
 
-def attributes_at(place: AbstractPlace) -> dict[str, Any]:
-    """Attributes of a store. **Raises:** `StoreError` if there is none, or if they are damaged."""
-    document = _document(place)
-    if CHECKSUM in document["attributes"]:
-        require_intact(place, document)
-    return document["attributes"]
-
-
-def _document(place: AbstractPlace) -> Document:
+def _document(path: Path) -> Document:
     try:
-        root = place.read(ROOT)
-        if root is None:
-            raise ValueError(f"no {ROOT}")
-        document = json.loads(root)
+        document = json.loads((path / ROOT).read_bytes())
         if not isinstance(document["attributes"], dict):
             raise ValueError("no attributes")
         return document
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise StoreError(
-            f"{place.name}: is not a store that jaxmuscle wrote, or its {ROOT} is damaged"
+            f"{path}: is not a store that jaxmuscle wrote, or its {ROOT} is damaged"
             f" ({error}); give another name"
         ) from None
 
 
-def state_of(place: AbstractPlace, wanted: dict[str, Any], *, begin: Begin) -> str:
+def state_of(path: Path, wanted: dict[str, Any], *, begin: str) -> str:
     """Whether a store of these attributes is "absent", to be "overwritten", "begun" or "complete".
 
-    **Raises:** `StoreError` if it is there and not to be resumed, was made with other settings
-    (named) or in other parts.
+    **Raises:** `StoreError` if it is there and not to be resumed, or was made with other settings
+    (named).
     """
-    if not place.exists():
+    if not is_there(path):
         return "absent"
     if begin == "new":
         raise StoreError(
-            f"{place.name}: exists already; resume it (--resume, resume=True), overwrite it"
+            f"{path}: exists already; resume it (--resume, resume=True), overwrite it"
             " (--force, overwrite=True), or give another name"
         )
     if begin == "overwrite":
-        _require_ensemble(place, _document(place)["attributes"])
+        _require_ensemble(path, _document(path)["attributes"])
         return "overwritten"
-    found = ensemble_at(place)
-    _refuse(place, json.loads(found[SETTINGS]), json.loads(wanted[SETTINGS]))
-    if found["complete"]:
-        return "complete"
-    there = found.get(PARTS)
-    if there != wanted.get(PARTS):
-        made, remedy = (
-            ("without parts", "resume it without --part, part=")
-            if there is None
-            else (
-                f"in {there} parts",
-                (
-                    f"run each with --part I/{there}, part=(i, {there}), then merge them (jaxmuscle"
-                    " merge)"
-                ),
-            )
-        )
-        raise StoreError(f"{place.name}: is being made {made}: {remedy}, or give another name")
-    return "begun"
+    found = require_settings(path, wanted[SETTINGS])
+    return "complete" if found["complete"] else "begun"
 
 
-def ensemble_at(place: AbstractPlace) -> dict[str, Any]:
-    """Attributes of an ensemble's store. **Raises:** `StoreError` if it is something else, or
-    damaged."""
-    return description_of(place)["attributes"]
-
-
-def description_of(place: AbstractPlace) -> Document:
-    """The whole description of an ensemble's store. **Raises:** `StoreError` if it is something
-    else, or damaged."""
-    document = _document(place)
-    _require_ensemble(place, document["attributes"])
-    if "random numbers" in document["attributes"][SETTINGS]:
-        require_intact(place, document)
-    return document
-
-
-def _require_ensemble(place: AbstractPlace, attributes: dict[str, Any]) -> None:
-    if SETTINGS not in attributes or "complete" not in attributes:
-        raise StoreError(
-            f"{place.name}: is not an ensemble that can be resumed (no settings in it); give"
-            " another name"
-        )
-
-
-def _refuse(place: AbstractPlace, there: dict[str, Any], here: dict[str, Any]) -> None:
-    if "random numbers" not in there:
-        raise StoreError(
-            f"{place.name}: was begun by an earlier version of jaxmuscle, whose seeds have other"
-            " noise. So it cannot go on: begin it anew (--force, overwrite=True), or give another"
-            " name"
-        )
+def require_settings(path: Path, wanted: str) -> dict[str, Any]:
+    """The attributes of a store that was made with the settings that are wanted. **Raises:**
+    `StoreError`."""
+    found = description_of(path)["attributes"]
+    there, here = json.loads(found[SETTINGS]), json.loads(wanted)
     different = differences(there, here)
     if different:
         raise StoreError(
-            f"{place.name}: was made with other settings: {'; '.join(different)}. Repeat them, or"
+            f"{path}: was made with other settings: {'; '.join(different)}. Repeat them, or"
             " give another name"
+        )
+    return found
+
+
+def description_of(path: Path) -> Document:
+    """The whole description of an ensemble's store. **Raises:** `StoreError` if it is something
+    else, or damaged."""
+    document = _document(path)
+    _require_ensemble(path, document["attributes"])
+    if "random numbers" not in document["attributes"][SETTINGS]:
+        raise StoreError(
+            f"{path}: was begun by an earlier version of jaxmuscle, whose seeds have other"
+            " noise. So it cannot go on: begin it anew (--force, overwrite=True), or give another"
+            " name"
+        )
+    require_intact(path, document)
+    return document
+
+
+def _require_ensemble(path: Path, attributes: dict[str, Any]) -> None:
+    if SETTINGS not in attributes or "complete" not in attributes:
+        raise StoreError(
+            f"{path}: is not an ensemble that can be resumed (no settings in it); give another name"
         )
 
 
@@ -264,96 +252,60 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def write_region(place: AbstractPlace, region: Any, values: Mapping[str, np.ndarray]) -> None:
+def write_region(path: Path, region: Any, values: Mapping[str, np.ndarray]) -> None:
     """Write part of some arrays; the region cuts their leading dimensions."""
-    with writing(place):
-        for name, array in _arrays(place.opened(), values).items():
+    with writing(path):
+        for name, array in _arrays(path, values).items():
             array[region] = values[name]
 
 
-def write_arrays(place: AbstractPlace, values: Mapping[str, np.ndarray]) -> None:
+def read_arrays(path: Path, names: Iterable[str], region: Any = ...) -> dict[str, np.ndarray]:
+    """Some arrays, or the same part of each."""
+    import zarr
+
+    group: Any = zarr.open_group(path, mode="r")
+    return {name: np.asarray(group[name][region]) for name in names}
+
+
+def write_arrays(path: Path, values: Mapping[str, np.ndarray]) -> None:
     """Write whole arrays, which are on disk afterwards."""
-    document = _document(place)
-    write_region(place, ..., values)
-    with writing(place):
-        place.settle(key for name in values for key in keys_of_array(document, name))
+    write_region(path, ..., values)
+    document = description_of(path)
+    settle(path, [key for name in values for key in keys_of_array(document, name)])
 
 
-Log = Callable[[int, list[list[int]]], None]
+def settle(path: Path, keys: Iterable[str]) -> None:
+    """Wait until these files are on disk, and the folders that hold them."""
+    files = [path / key for key in keys]
+    above = {folder for file in files for folder in file.parents}
+    with writing(path):
+        to_disk([*files, *(above - set(path.parents))])
 
 
-@contextlib.contextmanager
-def chunk_log(place: AbstractPlace) -> Iterator[Log]:
-    """What is called with every chunk that has been written, and the (point, seed) that failed in
-    it.
-
-    The chunks are put on disk, then said to be there, together every second and at the end: one by
-    one it takes far longer.
-    """
-    document, waiting, due = _document(place), {}, 0.0
-
-    def commit() -> None:
-        with writing(place):
-            place.settle(key for chunk in waiting for key in keys_of_chunk(document, chunk))
-        say_done(place, waiting)
-        waiting.clear()
-
-    def log(chunk: int, failed: list[list[int]]) -> None:
-        nonlocal due
-        waiting[chunk] = failed
-        if time.monotonic() >= due:
-            commit()
-            due = time.monotonic() + LOG_EVERY
-
-    try:
-        yield log
-    finally:
-        commit()
+def replace(path: Path, key: str, data: bytes) -> None:
+    """Replace a file of a store in one step; it is on disk afterwards."""
+    file = path / key
+    with writing(path):
+        with replacing(file) as unfinished:
+            unfinished.write_bytes(data)
+            to_disk([unfinished])
+        to_disk([file.parent, path])
 
 
-def done_key(chunk: int) -> str:
-    """The key that says that a chunk is on disk."""
-    return f"{DONE}{chunk:08d}.json"
-
-
-def say_done(place: AbstractPlace, chunks: Mapping[int, list[list[int]]]) -> None:
-    """These chunks are on disk, and these (point, seed) failed in them."""
-    with writing(place):
-        place.write(
-            {
-                done_key(chunk): sealed(json.dumps(failed).encode())
-                for chunk, failed in chunks.items()
-            }
-        )
-
-
-def logged(place: AbstractPlace, among: Iterable[int] | None = None) -> dict[int, list[list[int]]]:
-    """Complete chunks of a store of trajectories, all or `among` these, with the (point, seed) that
-    failed in them."""
-    keys = {
-        int(key.removeprefix(DONE)[:8]): key for key in place.progress() if key.startswith(DONE)
-    }
-    numbers = sorted(keys.keys() if among is None else keys.keys() & set(among))
-    with ThreadPoolExecutor() as pool:  # an object store takes tens of milliseconds for each
-        found = pool.map(lambda number: unsealed(place.read(keys[number]) or b""), numbers)
-        return {
-            number: json.loads(data)
-            for number, data in zip(numbers, found, strict=True)
-            if data is not None
-        }
-
-
-def complete(place: AbstractPlace, attributes: dict[str, Any]) -> None:
-    """Say that a store is complete, then drop what was needed to resume it."""
-    describe(place, attributes | {"complete": True})
-    with writing(place):
-        place.forget()
-
-
-def describe(place: AbstractPlace, attributes: dict[str, Any]) -> None:
+def describe(path: Path, attributes: dict[str, Any]) -> None:
     """Set attributes of a store."""
-    document = description_of(place)
-    with writing(place):
-        place.write(
-            {ROOT: text_of(stamped(document | {"attributes": document["attributes"] | attributes}))}
-        )
+    document = description_of(path)
+    found = document | {"attributes": document["attributes"] | attributes}
+    replace(path, ROOT, text_of(stamped(found)))
+
+
+def forget(path: Path) -> None:
+    """Remove what was needed to resume a store, and what processes that were killed left. For the
+    only writer."""
+    with writing(path):
+        shutil.rmtree(path / PROGRESS, ignore_errors=True)
+        for unfinished in [*path.rglob("*.partial"), *path.rglob(".zarr-*.json")]:  # zarr's, ours
+            unfinished.unlink(missing_ok=True)
+        for built in path.parent.iterdir():
+            if built.name.startswith(_prefix(path)):
+                shutil.rmtree(built)

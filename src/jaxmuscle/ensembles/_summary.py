@@ -1,7 +1,6 @@
 """What is left of an ensemble that was reduced while it ran: moments, quantiles and the mean
 spectrum."""
 
-import dataclasses
 import json
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+VARIATION = "coefficient_of_variation", "coefficient_of_variation_stderr"
 # Fields of a spectrum, and their names as arrays.
 SPECTRUM = {
     "power": "power",
@@ -140,12 +140,8 @@ class EnsembleSummary(Printed, Result, eqx.Module):
         }
         if self.spectra:
             found["frequency"] = ("frequency",), np.asarray(self.spectra[0].frequency), "Hz"
-            found["coefficient_of_variation"] = lead, self.coefficient_of_variation[..., 0], "1"
-            found["coefficient_of_variation_stderr"] = (
-                lead,
-                self.coefficient_of_variation[..., 1],
-                "1",
-            )
+            for i, name in enumerate(VARIATION):
+                found[name] = lead, self.coefficient_of_variation[..., i], "1"
             for name, label in SPECTRUM.items():
                 rows = [getattr(spectrum, name) for spectrum in self.spectra]
                 if rows[0] is not None:
@@ -154,40 +150,6 @@ class EnsembleSummary(Printed, Result, eqx.Module):
         if isinstance(self.task, Sweep):
             found |= {name: (("point",), values, "") for name, values in self.task.labels.items()}
         return found
-
-    def with_arrays(
-        self, arrays: dict[str, np.ndarray], failed: Int[np.ndarray, "failed 2"]
-    ) -> "EnsembleSummary":
-        """A copy with the values of `arrays` (as `arrays()` names them) and other failed seeds."""
-        variation, spectra = self.coefficient_of_variation, self.spectra
-        if spectra:
-            variation = np.stack(
-                [arrays["coefficient_of_variation"], arrays["coefficient_of_variation_stderr"]],
-                axis=-1,
-            )
-            rows = {
-                name: np.atleast_2d(arrays[label])
-                for name, label in SPECTRUM.items()
-                if label in arrays
-            }
-            left = [
-                self.seeds - int(np.sum(failed[:, 0] == point)) for point in range(len(spectra))
-            ]
-            spectra = tuple(
-                dataclasses.replace(
-                    spectrum, seeds=left[i], **{name: values[i] for name, values in rows.items()}
-                )
-                for i, spectrum in enumerate(spectra)
-            )
-        return dataclasses.replace(
-            self,
-            mean=arrays["mean"],
-            variance=arrays["variance"],
-            quantile=arrays["quantiles"],
-            coefficient_of_variation=variation,
-            spectra=spectra,
-            failed=failed,
-        )
 
     def __str__(self) -> str:
         swept = isinstance(self.task, Sweep)
@@ -225,64 +187,51 @@ def computed(
         "variance": variance[:, :samples],
         "quantiles": quantiles(tally, levels),
     }
-    if bins:
-        plain, left = slice(samples, samples + bins), slice(samples + bins, samples + 2 * bins)
-        found |= {
-            "coefficient_of_variation": averages[:, -1],
-            "coefficient_of_variation_stderr": stderr[:, -1],
-            "plain_power": averages[:, plain],
-            "plain_stderr": stderr[:, plain],
-        }
-        if expected is None:
-            found |= {"power": averages[:, plain], "power_stderr": stderr[:, plain]}
-        else:
-            found |= {
-                "power": expected + averages[:, left],
-                "power_stderr": stderr[:, left],
-                "power_expected": expected,
-            }
-    return found
+    if not bins:
+        return found
+    plain, left = slice(samples, samples + bins), slice(samples + bins, samples + 2 * bins)
+    found |= dict(zip(VARIATION, (averages[:, -1], stderr[:, -1]), strict=True))
+    found |= {"plain_power": averages[:, plain], "plain_stderr": stderr[:, plain]}
+    if expected is None:
+        return found | {"power": averages[:, plain], "power_stderr": stderr[:, plain]}
+    return found | {
+        "power": expected + averages[:, left],
+        "power_stderr": stderr[:, left],
+        "power_expected": expected,
+    }
 
 
 def summarised(
     layout: Layout,
-    tally: RunningMoments,
     levels: tuple[float, ...],
-    expected: Float[np.ndarray, "points bins"] | None,
+    arrays: dict[str, np.ndarray],
     failed: Int[np.ndarray, "failed 2"],
     about: dict[str, Any],
 ) -> EnsembleSummary:
-    """A tally in words; `expected`, the exact linear spectra or None."""
-    arrays = computed(tally, levels, expected)
-    task, settings, points = layout.task, layout.recipe.settings, len(tally.seeds)
-    unit = layout.task_of(0).output_unit
-    variation, spectra = np.full((points, 2), np.nan), []
+    """What `arrays` say, which are named and shaped as `EnsembleSummary.arrays` has them."""
+    task, settings, spectra = layout.task, layout.recipe.settings, []
     if "power" in arrays:
-        variation = np.stack(
-            [arrays["coefficient_of_variation"], arrays["coefficient_of_variation_stderr"]], axis=-1
-        )
-        for i, seen in enumerate(tally.seeds):
-            row: dict[str, Any] = {
-                name: arrays[label][i] for name, label in SPECTRUM.items() if label in arrays
-            }
-            row = {"expected": None} | row
+        variation = np.stack([arrays[name] for name in VARIATION], axis=-1)
+        rows = {n: np.atleast_2d(arrays[label]) for n, label in SPECTRUM.items() if label in arrays}
+        for i in range(layout.points):
+            row: dict[str, Any] = {"expected": None} | {n: values[i] for n, values in rows.items()}
+            left = len(layout.seeds) - int(np.sum(failed[:, 0] == i))
+            unit = layout.task_of(i).output_unit
             spectra.append(
                 SpectrumEstimate(
-                    settings.frequency, **row, seeds=int(seen), settings=settings, unit=unit
+                    settings.frequency, **row, seeds=left, settings=settings, unit=unit
                 )
             )
-    found = [arrays["mean"], arrays["variance"], arrays["quantiles"], variation]
-    mean, variance, quantile, variation = (
-        found if isinstance(task, Sweep) else [values[0] for values in found]
-    )
+    else:
+        variation = np.full((*arrays["mean"].shape[:-1], 2), np.nan)
     return EnsembleSummary(
         task,
         len(layout.seeds),
         layout.time,
-        mean,
-        variance,
+        arrays["mean"],
+        arrays["variance"],
         levels,
-        quantile,
+        arrays["quantiles"],
         variation,
         tuple(spectra),
         failed,
