@@ -21,6 +21,8 @@ SETTINGS = {
     "distributed.deploy.lost-worker-timeout": "10m",
     # of the workers that a block was on: a machine with little memory kills more than 3
     "distributed.scheduler.allowed-failures": 100,
+    # looks at the stack a hundred times a second, for a tenth of the processor time
+    "distributed.worker.profile.enabled": False,
     "distributed.worker.multiprocessing-method": "spawn",  # JAX does not run in a fork
 }
 # Ctrl-C reaches all processes of a terminal; it is this one that ends the others, without a word.
