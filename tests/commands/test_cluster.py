@@ -3,6 +3,7 @@
 import importlib.util
 import logging
 import os
+import signal
 import socket
 
 import pytest
@@ -43,6 +44,8 @@ def test_workers_of_our_own_are_quick_lasting_and_out_of_reach(monkeypatch):
         found = client.get_executor(pure=False).submit(environment_of, 0).result()
         assert found == dict(zip(THREADS, (None, "1", "1"), strict=True))
         (pid,) = client.run(os.getpid).values()
+        os.kill(pid, signal.SIGINT)  # as a terminal does at Ctrl-C; this process ends them
+        assert client.run(os.getpid) == dict.fromkeys(client.nthreads(), pid)
     assert dask.config.get("distributed.deploy.lost-worker-timeout") != "10m"
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)

@@ -21,8 +21,8 @@ Made = TypeVar("Made")
 WINDOW = 512
 PATIENCE = 60.0  # seconds without a result after which it is looked for workers
 AGAIN = (
-    "What is complete stays where there is a store: the same call or command again, with resume"
-    " (--resume), goes on"
+    "Give the same call or command again; one that writes a store goes on with `resume=True`"
+    " (--resume)"
 )
 
 

@@ -21,8 +21,12 @@ SETTINGS = {
     "distributed.deploy.lost-worker-timeout": "10m",
     # of the workers that a block was on: a machine with little memory kills more than 3
     "distributed.scheduler.allowed-failures": 100,
+    # looks at the stack a hundred times a second, for a tenth of the processor time
+    "distributed.worker.profile.enabled": False,
     "distributed.worker.multiprocessing-method": "spawn",  # JAX does not run in a fork
 }
+# Ctrl-C reaches all processes of a terminal; it is this one that ends the others, without a word.
+DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 BEGINS_WITH = "distributed.nanny.pre-spawn-environ"
 TRIM = "MALLOC_TRIM_THRESHOLD_"
 
@@ -97,6 +101,7 @@ def _client_here(count: int | None) -> Iterator[Any]:
             memory_limit=0,  # as this process, which has none
             # XLA's other threads would spin beside those of the other workers
             env={"PJRT_NPROC": "1"},
+            preload=DEAF,
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
