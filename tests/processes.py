@@ -32,7 +32,6 @@ from typing import Any
 SRC = Path(__file__).parents[1] / "src"
 IMPORTED = (
     "diffrax",
-    "jax.experimental.multihost_utils",
     "jax.experimental.serialize_executable",
     "jax.scipy.linalg",
     "jaxmuscle.commands.main",

@@ -185,7 +185,8 @@ def test_a_store_is_resumed_by_others(tmp_path, monkeypatch, client, kept):
             **given,
         )
         equal(found, whole_of(kept, client if second is client else None), kept)
-        assert 0 < len(told) <= 5
+        # a worker ends what it had begun: there may be no chunk left
+        assert len(told) == 5 if kept else len(told) <= 5
 
 
 def test_damage_is_found_and_mended_by_workers(tmp_path, client, caplog):
@@ -266,8 +267,8 @@ def test_the_command_shares_work(tmp_path, monkeypatch, client):
 
     @contextlib.contextmanager
     def workers_of(count, scheduler):
-        assert (count, scheduler) == (2, None)
-        yield client
+        assert scheduler is None and count in (None, 2)
+        yield client if count else None
 
     monkeypatch.setattr(command, "workers_of", workers_of)
     arguments = ["ensemble", "zagrodny-slifkin", "--seeds", "60", "--duration", "1", "--chunk", "8"]

@@ -242,20 +242,14 @@ def _levels(reduce: bool | tuple[float, ...], *, weak: bool) -> tuple[float, ...
         or not all(is_real(level) and 0 < level < 1 for level in levels)
     ):
         raise ValueError(f"reduce = {reduce}: levels of quantiles lie between 0 and 1")
-    if weak:
-        _require_near(levels)
-    return tuple(sorted(map(float, levels)))
-
-
-def _require_near(levels: Sequence[float]) -> None:
-    """Weak increments have no tails."""
     outside = [level for level in levels if not FURTHEST <= level <= 1 - FURTHEST]
-    if outside:
+    if weak and outside:
         raise ValueError(
-            f'reduce = {tuple(levels)} with increments = "weak": quantiles beyond {FURTHEST:g} and'
+            f'reduce = {levels} with increments = "weak": quantiles beyond {FURTHEST:g} and'
             f" {1 - FURTHEST:g} depend on the tails of single increments ({listed(outside)}): leave"
             " increments out"
         )
+    return tuple(sorted(map(float, levels)))
 
 
 def everything(

@@ -23,7 +23,6 @@ from ._store import (
     description_of,
     folder_of,
     forget,
-    is_there,
     replace,
     state_of,
     text_of,
@@ -152,7 +151,7 @@ def open_store(path: str | Path) -> "xarray.Dataset":
     import xarray
 
     folder = folder_of(path)
-    if not is_there(folder):
+    if not folder.exists():
         raise StoreError(f"{folder}: there is no store; give the folder of one")
     document = description_of(folder)
     if not document["attributes"]["complete"]:

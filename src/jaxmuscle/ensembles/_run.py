@@ -245,7 +245,7 @@ def _rows(layout: Layout, found: dict[str, np.ndarray], row: int) -> np.ndarray:
     if not layout.bins:
         return output.astype(float)
     power = found["power"][row]
-    left = power - found["linear_power"][row] if layout.linear is not None else np.zeros_like(power)
+    left = power - found["linear_power"][row] if layout.linear is not None else 0 * power
     return np.concatenate(
         [output, power, left, found["variation"][row][:, None]], axis=1, dtype=float
     )

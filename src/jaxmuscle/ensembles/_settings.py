@@ -14,7 +14,7 @@ from jaxmuscle.model._stream import VERSION as STREAM
 from jaxmuscle.simulation._trajectory import run_attributes
 
 from ._layout import Cut, Layout
-from ._store import SETTINGS, description_of, is_there
+from ._store import SETTINGS, description_of
 from ._sweep import Sweep
 
 CUT = "points at once", "chunk", "exact quantiles"
@@ -23,7 +23,7 @@ CUT = "points at once", "chunk", "exact quantiles"
 def begun_with(path: Path) -> Cut | None:
     """How an existing store was cut, so that it can be resumed with other devices; None if there is
     none."""
-    if not is_there(path):
+    if not path.exists():
         return None
     settings = json.loads(description_of(path)["attributes"][SETTINGS])
     return Cut(*(settings.get(name, 1) for name in CUT))

@@ -47,11 +47,6 @@ def folder_of(store: str | Path) -> Path:
     return Path(store)
 
 
-def is_there(path: Path) -> bool:
-    """Whether a store, or something else, is there."""
-    return path.exists() or path.is_symlink()
-
-
 def create(
     path: Path,
     variables: Mapping[str, Variable],
@@ -163,7 +158,7 @@ def attributes_of(path: str | Path) -> dict[str, Any] | None:
     **Raises:** `StoreError` if something else is there.
     """
     folder = folder_of(path)
-    return description_of(folder)["attributes"] if is_there(folder) else None
+    return description_of(folder)["attributes"] if os.path.lexists(folder) else None
 
 
 def _document(path: Path) -> Document:
@@ -185,7 +180,7 @@ def state_of(path: Path, wanted: dict[str, Any], *, begin: str) -> str:
     **Raises:** `StoreError` if it is there and not to be resumed, or was made with other settings
     (named).
     """
-    if not is_there(path):
+    if not os.path.lexists(path):
         return "absent"
     if begin == "new":
         raise StoreError(
