@@ -90,9 +90,7 @@ IN_NOTEBOOKS = {
     "04-from-recording-to-parameters": {"target, starts=40": f"target, {FEW}"},
     "05-uncertainty-and-noise-colour": {
         f"target, {FULL}": "target",
-        'task, target, noises=("band-limited", "ornstein-uhlenbeck"), groups=3': (
-            "jm.Isometric(), target"
-        ),
+        "task, target, noises=noises, groups=3": ("jm.Isometric(), target"),
         f"jm.Isometric(), measured, {FULL}": f"person, measured, {FEW}",
         "hand = result.task": f"result = {PLAIN_FIT}\nhand = result.task",
         # In the precision of the fit's own simulations: one program.
