@@ -49,7 +49,6 @@ ENSEMBLE = {
     "increments": (3, "x", None),
     "generator": (3, "x"),
     "control": ("x",),
-    "part": (3, (1,), (0, 2), (3, 2), (1.5, 2), (True, 2)),
 }
 SETTINGS = {
     "rate": (0, -1, np.nan, "x", True, 1e300, None),

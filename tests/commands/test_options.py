@@ -22,7 +22,6 @@ MADE = typer.main.get_command(app)
 VALID = {
     "fit": ["t.csv", "--segments", "12"],
     "simulate": ["zagrodny-slifkin"],
-    "merge": ["none.zarr"],
     "analyse": ["r.csv"],
     "ensemble": ["zagrodny-slifkin", "--seeds", "4", "--out", "e.zarr"],
     "steadiness": ["r.csv"],

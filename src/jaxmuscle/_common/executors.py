@@ -79,13 +79,13 @@ def results_of(
     executor: AnyExecutor,
     work: Callable[[Item], Made],
     items: Iterable[Item],
-    window: int = WINDOW,
+    window: int | None = None,
 ) -> Generator[tuple[Item, Made], None, None]:
     """Every item and `work(item)`, in the order of the items.
 
-    At most `window` items are under way. `work` may be done twice for an item, where a worker is
-    lost, so it must do no harm. A result is given up as soon as it is here: Dask computes again
-    what a lost worker had and somebody still wants.
+    At most `window` items are under way, by default `WINDOW`. `work` may be done twice for an item,
+    where a worker is lost, so it must do no harm. A result is given up as soon as it is here: Dask
+    computes again what a lost worker had and somebody still wants.
 
     **Raises:** what `work` raises; `WorkersLostError` if the workers, or their scheduler, are lost.
     """
@@ -97,7 +97,7 @@ def results_of(
     wanted = next(turn)
     try:
         while True:
-            room = window - len(under_way) - len(waiting)
+            room = (window or WINDOW) - len(under_way) - len(waiting)
             for number, item in itertools.islice(rest, room):
                 future = _submitted(pool, call, item)
                 under_way[future] = number, item

@@ -10,8 +10,6 @@ from typing import Annotated, Any
 
 import typer
 
-from jaxmuscle._common.arguments import require_extra
-
 from .console import err, plain
 
 ANSWER = 30  # seconds in which a scheduler has to answer
@@ -72,6 +70,8 @@ def workers_of(count: int | None, scheduler: str | None) -> Iterator[Any]:
             f"--workers {count} and --scheduler {scheduler}: give one; a scheduler has its own"
             " workers"
         )
+    from jaxmuscle._common.arguments import require_extra  # and numpy, which --help does without
+
     require_extra("dask")
     import distributed  # noqa: F401  # sets its own levels
 
