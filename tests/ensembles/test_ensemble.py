@@ -716,13 +716,13 @@ def test_kill_9_four_times(tmp_path, kind):
 
 
 def amount(path):
-    """How much is in a store that is not complete."""
-    size = 0
+    """What is in a store that is not complete: its chunks, and when its tally was written."""
+    found = set()
     for file in [*(path / "progress").glob("[!.]*"), *(path / "F_ext" / "c").glob("*/0")]:
         # the end of a run removes the tally
         with contextlib.suppress(FileNotFoundError):
-            size += file.stat().st_size
-    return size
+            found.add((file, file.stat().st_mtime_ns))
+    return found
 
 
 MEMORY = """

@@ -121,11 +121,11 @@ def test_metadata_of_the_wheel(built):
     assert set(data.get_all("Provides-Extra", [])) == {
         "all",
         "c3d",
+        "dask",
         "kernel",
         "labs",
         "notebooks",
         "posterior",
-        "url",
     }
     assert f"{folder}/licenses/LICENSE" in archive.namelist()
     assert archive.read(f"{folder}/entry_points.txt").decode().split() == [
