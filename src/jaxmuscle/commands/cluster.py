@@ -99,8 +99,6 @@ def _client_here(count: int | None) -> Iterator[Any]:
             protocol="tcp",
             dashboard_address="127.0.0.1:0",
             memory_limit=0,  # as this process, which has none
-            # XLA's other threads would spin beside those of the other workers
-            env={"PJRT_NPROC": "1"},
             preload=DEAF,
             silence_logs=logging.CRITICAL,
         ) as cluster,
