@@ -19,7 +19,7 @@ Made = TypeVar("Made")
 # Blocks under way or waiting for an earlier one. More keep more workers busy; what they return
 # waits in memory, up to 4 MB each.
 WINDOW = 512
-PATIENCE = 60.0  # seconds without a result after which it is looked for workers
+PATIENCE = 60.0  # seconds without a result, after which a scheduler is asked for its workers
 AGAIN = (
     "Give the same call or command again; one that writes a store goes on with `resume=True`"
     " (--resume)"
@@ -93,32 +93,28 @@ def results_of(
     rest, ended = enumerate(items), queue.SimpleQueue()
     under_way: dict[Future[Any], tuple[int, Any]] = {}
     waiting: dict[int, tuple[Any, Any]] = {}
-    turn = itertools.count()
-    wanted = next(turn)
+    wanted = 0
     try:
         while True:
             room = (window or WINDOW) - len(under_way) - len(waiting)
             for number, item in itertools.islice(rest, room):
-                future = _submitted(pool, call, item)
+                with _losses():
+                    future = pool.submit(call, item)
                 under_way[future] = number, item
                 future.add_done_callback(ended.put)
             if not under_way:
                 return
             future = _next_ended(ended, executor)
             number, item = under_way.pop(future)
-            waiting[number] = item, _result(future)
+            with _losses():
+                waiting[number] = item, future.result()
             del future
             while wanted in waiting:
                 yield waiting.pop(wanted)
-                wanted = next(turn)
+                wanted += 1
     finally:
         for future in under_way:
             future.cancel()
-
-
-def _submitted(pool: Executor, call: Any, item: Any) -> Future[Any]:
-    with _losses():
-        return pool.submit(call, item)
 
 
 def _next_ended(ended: "queue.SimpleQueue[Future[Any]]", executor: AnyExecutor) -> Future[Any]:
@@ -130,11 +126,6 @@ def _next_ended(ended: "queue.SimpleQueue[Future[Any]]", executor: AnyExecutor) 
                 continue
             if not executor.scheduler_info().get("workers"):
                 LOG.warning("notice: the scheduler has no workers now; waiting for some to come")
-
-
-def _result(future: Future[Any]) -> Any:
-    with _losses():
-        return future.result()
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ SETTINGS = {
     # A worker that takes longer to begin again would be given up for good, and a run without
     # workers waits for ever.
     "distributed.deploy.lost-worker-timeout": "10m",
-    # of the workers that a block was on: a machine with little memory kills more than 3
+    # workers that may die with a block before Dask gives the block up; by default 3
     "distributed.scheduler.allowed-failures": 100,
     # looks at the stack a hundred times a second, for a tenth of the processor time
     "distributed.worker.profile.enabled": False,
