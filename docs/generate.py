@@ -111,7 +111,7 @@ an error names the file and the key. Numbers must be finite. `true` is not 1, an
 
 `docs/generate.py` writes this page from the code that checks the files.
 """
-FIT_FILE = """JSON, format 5. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
+FIT_FILE = """JSON, format 6. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
 `task_table` alone. A fit of one target has the keys of the first two tables side by side. In a
 [joint fit](../identifiability.md#a-joint-fit) (*several targets* below)
 the keys of the second table stand under `parts`, by the name of the target. What the file says twice must agree: the

@@ -168,7 +168,7 @@ def test_what_a_fit_says_and_keeps(result, tmp_path):
     assert str(again) == text
     np.testing.assert_array_equal(again.only.stiffness, result.only.stiffness)
     np.testing.assert_array_equal(again.target.stiffness.value, result.target.stiffness.value)
-    assert len(result.ladder) == 1 and result.ladder[0].model == "noise alone"
+    assert len(result.ladder) == 1 and result.ladder[0].model == "slow part alone"
 
 
 @pytest.mark.slow
@@ -553,7 +553,7 @@ def test_a_line_in_the_fluctuations_is_fitted_though_noise_alone_passes():
             jm.PrescribedLength(), recorded(5, line=0.003), rungs=1, starts=8, check_seeds=0
         )
     before, after = result.ladder[:2]
-    assert (before.model, after.number) == ("noise alone", 0) and before.p >= 0.01
+    assert (before.model, after.number) == ("slow part alone", 0) and before.p >= 0.01
     assert after.aic < before.aic - 2 and result.adequate
     assert abs(result.only.task["harmonic_frequency"] - 4.25) < 0.2
     for name, true in WHOLE.items():

@@ -72,8 +72,8 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "deviation": rng.uniform(0.1, 0.3, 30),
         "components": {"relaxation": rng.uniform(0, 1, 30), "resonance": rng.uniform(0, 1, 30)},
         "ladder": (
-            Rung(0, "base", -250.1, 6.5, 1.9, 0.002, False),
-            Rung(1, "with activation", -260.0, 7.1, 0.9, 0.3, True),
+            Rung(0, "slow part + regular rhythm", -250.1, 6.5, 1.9, 0.002, False),
+            Rung(1, "slow part + twitch + regular rhythm", -260.0, 7.1, 0.9, 0.3, True),
         ),
         "starts": (
             Start(1.5, True, 12, (4e5, 50 / 3), "spread"),
@@ -91,6 +91,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "further": {"coefficient_of_variation": -1.5},
         "stiffness": None,
         "notices": ("a notice",),
+        "unstated": ("why a number is not stated",),
         "seed": 3,
         "settings": {
             "free": ["k_w", "c_w"],
@@ -176,7 +177,9 @@ def test_every_number_by_its_name():
         "Hz",
         (0.31, None),
     )
-    assert result["c_w"].value == result.task["c_w"] and result["m_w"].stderr is None
+    # newtons are unknown: damping and masses per newton of the model's mean force, 2.5 N
+    assert result["c_w"].value == pytest.approx(float(result.task["c_w"]) / 2.5)
+    assert result.parameters["c_w"].value == result.task["c_w"] and result["m_w"].stderr is None
     with pytest.raises(
         ValueError,
         match="unknown quantity 'corner_frequenzy' of the fit of made: did you mean 'corner_f",
@@ -208,7 +211,8 @@ def test_a_result_as_a_table():
         "determined",
     ]
     assert table.index.is_unique
-    assert set(table.index) == {*result.measured, *result.parameters, *result.derived}
+    known = {*result.measured, *result.parameters, *result.derived}
+    assert set(table.index) == known - {"model_mean"}  # which is 1 N per newton
     count = len(result.measured)
     assert list(table.index[:count]) == list(result.measured)
     assert set(table["kind"][:count]) == {"measured"} and "measured" not in set(
@@ -605,12 +609,12 @@ def test_an_unknown_preset_names_the_nearest(monkeypatch):
 @pytest.mark.parametrize(
     ("ends", "words"),
     [
-        ((11.968, 12.0628), "11.97 to 12.06"),  # three digits of each would say 12 to 12.1
-        ((0.6381, 1.2812), "0.638 to 1.28"),
-        ((-0.0004, 0.0), "-0.0004 to 0"),
-        ((1e5, 1e5), "1e+05 to 1e+05"),
-        ((0.3112, None), "above 0.311"),
-        ((None, 12.0628), "below 12.1"),
+        ((11.968, 12.0628), "11.968 to 12.063"),  # three digits of each would say 12 to 12.1
+        ((0.6381, 1.2812), "0.64 to 1.28"),  # as many places as 1.00 ± 0.10
+        ((-0.0004, 0.0), "-0.00040 to 0.00000"),
+        ((1e5, 1e5), "100000 to 100000"),
+        ((0.3112, None), "above 0.31"),
+        ((None, 12.0628), "below 12.06"),
         ((None, None), "open"),
     ],
 )

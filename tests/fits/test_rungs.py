@@ -220,7 +220,7 @@ def test_a_richer_model_is_tried_where_the_first_does_not_describe_the_data():
     assert chosen.number == 1 and result.adequate
     assert chosen.aic == min(rung.aic for rung in result.ladder)
     text = result.details()
-    assert "models tried" in text and "-> 1 with activation" in text
+    assert "models tried" in text and "-> 1 slow part + twitch + regular rhythm" in text
     assert "for the description alone" in " ".join(text.split())
     kinds = {start.kind for start in result.starts}
     assert kinds == {"other model", "peak", "spread"}
@@ -232,7 +232,7 @@ def test_the_progress_says_which_model_it_is_at_and_never_falls_back():
     assert shares == sorted(shares) and shares[-1] == 1
     models = [text.partition(":")[0] for text, _ in told if text.startswith("model ")]
     assert list(dict.fromkeys(models)) == [f"model {k} (of models 0 to 3)" for k in (0, 1)]
-    assert "model 1 (of models 0 to 3): with activation" in dict(told)
+    assert "model 1 (of models 0 to 3): slow part + twitch + regular rhythm" in dict(told)
     # the descents' share of a fit
     assert max(share for text, share in told if text.startswith("model 1")) <= 2 / 4 * 0.6
 
@@ -281,14 +281,14 @@ def test_an_active_mass_far_from_its_prior_is_told():
     [
         (
             (0.15, 0.31),
-            "(0.15 to 0.31 s) is longer than in human muscle, 0.05 to 0.11 s. It also stands for",
+            "(0.150 to 0.310 s) is longer than in human muscle, 0.05 to 0.11 s. It also stands for",
         ),
         ((0.111, None), "(above 0.111 s) is longer"),
         (
             (0.01, 0.049),
-            "(0.01 to 0.049 s) is shorter than in human muscle, 0.05 to 0.11 s. The relaxation",
+            "(0.0100 to 0.0490 s) is shorter than in human muscle, 0.05 to 0.11 s. The relaxation",
         ),
-        ((None, 0.03), "(below 0.03 s) is shorter"),
+        ((None, 0.03), "(below 0.030 s) is shorter"),
         ((0.09, 0.31), ""),
         ((0.01, 0.06), ""),
         ((None, 0.31), ""),
@@ -327,7 +327,7 @@ def test_a_slow_twitch_is_told_by_the_fit():
     result = jm.fit(task, drawn(expected(task), 900, 1), **QUICK)
     low, _ = result.derived["contraction_time"].interval or (None, None)
     assert low is not None and low > 0.11
-    assert any(notice.startswith("contraction_time (") for notice in result.notices)
+    assert any(notice.startswith("contraction_time (") for notice in result.unstated)
 
 
 # --- what it gives
@@ -388,7 +388,7 @@ def test_bands_are_integrals_over_bins():
     for low, high in ((0, 0.5), (0.5, 1), (1, 2), (8, 12)):
         share = np.diff(np.interp([low, high], edges, total))[0]
         assert result.derived[f"band_{low:g}_{high:g}"].value == pytest.approx(share, rel=1e-3)
-    said = " ".join(str(result).partition("not determined")[0].split())
+    said = " ".join(result.details().partition("not determined")[0].split())
     # The first band holds the first bin (0.39 Hz, 0.39 Hz wide) up to 0.5 Hz: 0.78 of it.
     measured = (0.5 / result.target.settings.resolution - 0.5) * result.target.proportional_power[0]
     assert (

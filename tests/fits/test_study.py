@@ -246,7 +246,7 @@ def test_the_folder(tmp_path):
         "Holm",
         "paired t test",
         "Welch",
-        "with activation",
+        "slow part + twitch",
         f"jaxmuscle {jm.__version__}",
     ):
         assert said in methods, said
@@ -487,7 +487,7 @@ def test_a_whole_study_as_the_page_does_it(recorded, monkeypatch):
     (rung,) = found.cohort.results["b, tired"].ladder
     assert rung.chosen and rung.aic == pytest.approx(alone.ladder[0].aic, abs=1e-3)
     assert np.isclose(found.aic[0], sum(r.ladder[0].aic for r in found.cohort.results.values()))
-    assert "with the same model (base: noise and a harmonic)" in found.methods()
+    assert "with the same model (slow part + regular rhythm)" in found.methods()
     assert "Study: 4 people in 2 groups (x 2, y 2) in 2 conditions (rest, tired)" in str(found)
     assert {"people.csv", "study.json", "spectra.png", "methods.txt"} <= {
         p.name for p in (recorded / "out/study").iterdir()

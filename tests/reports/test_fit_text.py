@@ -10,7 +10,7 @@ from test_steadiness import trials
 import jaxmuscle as jm
 from jaxmuscle.fits import Estimate
 from jaxmuscle.fits._result import Adequacy
-from jaxmuscle.reports._fit_text import _table, fit_card
+from jaxmuscle.reports._fit_text import _table, fit_card, unknown_kinds
 
 
 @pytest.mark.parametrize("whose", ["", "@a"])
@@ -48,12 +48,8 @@ def test_the_table_of_a_failed_fit_has_numbers_in_its_columns_of_numbers():
     assert np.isnan(table.set_index("quantity")["value"]["model_mean"])
 
 
-PER_NEWTON = (
-    "stiffness and damping are stated here per newton of mean force. In fit.json (Python:"
-    " result['K_w0'], to_dataframe()) they are those of a model muscle that pulls with 2.5 N:"
-    " divide by 2.5 N"
-)
-VERDICT = "The model describes the data: chi2 per bin 0.90 (expected 0.86), p = 0.4"
+PER_NEWTON = "Forces, masses, stiffness and damping are stated per newton of mean force"
+VERDICT = "MODEL slow part + regular rhythm: fits, p = 0.4"
 CONVERGED = "converged: 1 of 2 starts reach a fit as good as this (cost within 5 %)"
 
 
@@ -65,46 +61,90 @@ def test_everything_shows_what_is_known_and_what_is_not():
     words = words_of(made_result().details())
     for part in (
         VERDICT,
+        "chi2 per bin 0.90 (expected 0.86)",
         CONVERGED,
+        "2 trials, 13 Welch segments",
         "c_w 6.667 ± 0.013",  # 16.667 N over a mean of 2.5 N
-        "corner_frequency 0.333 ± 0.010 above 0.31 Hz",
+        "corner_frequency 0.333 ± 0.010 above 0.310 Hz",
         "not determined: do not interpret these values (per newton of mean force): k_w",
         "the data leave open: - all stiffness and damping can be multiplied by one number",
         PER_NEWTON,
         "note: a notice",
+        "note: why a number is not stated",
     ):
         assert part in words
     assert words.index("determined by the data") < words.index("not determined: do not")
-    assert made_result()["c_w"].value / made_result()["model_mean"].value == pytest.approx(
-        6.667, abs=5e-4
-    )
+    assert "2.5 N" not in words  # nobody's force
+    assert made_result()["c_w"].value == pytest.approx(16.667 / 2.5, rel=1e-4)
 
 
 def test_the_text_of_a_spectrum_is_short():
-    """What is measured, the verdict, the parameters, and what is not known."""
+    """What was read, what is measured, the verdict, what is known of the model, what is not, what
+    to look at; and where the rest is."""
     text = str(made_result())
-    first, second, *_ = text.splitlines()
-    assert first == "made (user), Isometric, BandLimitedNoise, method montecarlo"
-    assert second.split("  ") == ["", "measured, without the model:", *second.split("  ")[2:]]
-    words = words_of(text)
     in_order = (
+        "made spectrum of force (user), 30 bins, 13 segments",
+        "MEASURED 95 % interval",
         "coefficient of variation 2 %",
         "median frequency",
         VERDICT,
-        CONVERGED,
-        "2 trials, 13 Welch segments",
-        "note: a notice",
-        "parameters (per newton of mean force): c_w 6.667 ± 0.013",
-        "not determined, one of many sets that fit (per newton of mean force): k_w 2e+05",
-        PER_NEWTON,
-        "all other numbers of the model: `jaxmuscle fit --all`, fit.json; in Python"
-        " result.details()",
+        "regular rhythm (harmonic) none seen, p = 0.08",
+        "c_w 6.667 ± 0.013",
+        "(per newton of mean force)",
+        "NOT KNOWN from these data: active stiffness",
+        "CHECK a notice",
+        "everything else: `jaxmuscle fit -v`, fit.json; in Python result.details()",
     )
+    words = words_of(text)
     places = [words.index(part) for part in in_order]
     assert places == sorted(places)
-    for absent in ("models tried", "AIC", "leave open", "corner_frequency", "do not interpret"):
+    for absent in (
+        "tried",
+        "AIC",
+        "leave open",
+        "corner_frequency",
+        "k_w",
+        "why a number",
+        "2.5 N",
+    ):
         assert absent not in words
-    assert words_of(str(failed_result())).count("Not fitted: no start has a finite spectrum") == 1
+    assert words_of(str(failed_result())).count("not fitted: no start has a finite spectrum") == 1
+
+
+NOTICES = tuple(f"notice {i} of many. What to do about it" for i in range(9))
+
+
+@pytest.mark.parametrize("case", ["describes", "misses"])
+def test_the_text_of_a_fit_fits_a_small_terminal(case):
+    """24 lines with the one that says what was written; 12 where the model misses."""
+    derived = {
+        "resonance_frequency": Estimate(9.28, "Hz", 0.11, interval=(9.1, 9.5)),
+        "half_power_frequency": Estimate(0.94, "Hz", 0.12, interval=(0.7, 1.2)),
+        "model_mean": Estimate(2.5, "N", None, True, False),
+    }
+    found = of_recordings(derived=derived, notices=NOTICES, **JUDGED[case])
+    lines = str(found).splitlines()
+    assert len(lines) < (12 if case == "misses" else 24) and max(map(len, lines)) <= 80
+    said = [line for line in lines if line.startswith("CHECK  ")]
+    assert said and " more)" in said[-1] and not any("What to do" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("notice", "words"),
+    [
+        ("the torque was divided. So it is a force", "the torque was divided"),
+        ("2.80 s to 19.19 s. Give a window", "2.80 s to 19.19 s"),
+        (f"K_w is negative for 20 % of the time, impossible: {'too strong ' * 6}", None),
+        (f"held: {'word ' * 20}", None),
+    ],
+)
+def test_a_check_is_the_first_sentence_and_of_a_long_one_what_stands_before_the_colon(
+    notice, words
+):
+    long = notice.startswith("K_w")
+    words = words or (notice.partition(": ")[0] if long else notice)
+    text = words_of(str(made_result(notices=(notice,))))
+    assert f"CHECK {words_of(words)} everything else" in text
 
 
 def test_the_methods_paragraph_says_what_a_reader_needs_to_repeat_the_fit():
@@ -125,7 +165,7 @@ def test_the_methods_paragraph_says_what_a_reader_needs_to_repeat_the_fit():
         "from 0.39 to 11.72 Hz",
         "describes the data: chi2 per bin 0.90 (expected 0.86), p = 0.4",
         "(standard deviations): k_w 5e+05 N/m^3 (1).",
-        "with activation (chi2 per bin 0.90, p = 0.3, AIC -260.0)",
+        "slow part + twitch + regular rhythm (chi2 per bin 0.90, p = 0.3, AIC -260.0)",
         "Held fixed were",
         "m_w = 0.5 kg",
         "Software: jaxmuscle 0.1, jax 0.8",
@@ -138,7 +178,7 @@ def test_the_methods_paragraph_says_what_a_reader_needs_to_repeat_the_fit():
 
 def test_text_counts_trials_and_segments_and_tells_how_much_the_trials_differ():
     def printed(**given):
-        return str(made_result(target=jm.Target("made", POWER, **given))).splitlines()
+        return made_result(target=jm.Target("made", POWER, **given)).details().splitlines()
 
     assert "  2 trials, 13 Welch segments" in printed(segments=[6, 7])
     alike = "  2 trials, 13 Welch segments, dispersion 1.12 ± 0.08 (1 if they are alike)"
@@ -149,7 +189,7 @@ def test_text_counts_trials_and_segments_and_tells_how_much_the_trials_differ():
 
 
 def test_the_text_and_the_report_say_why_a_richer_model_was_tried():
-    said = "base does not describe the data (p = 0.002). Richer models were tried"
+    said = "slow part + regular rhythm does not describe the data (p = 0.002). Richer models"
     found = made_result()
     assert said in " ".join(found.details().split())
     assert any(words.startswith(said) for words in found.summary().remarks)
@@ -179,7 +219,7 @@ def test_numbers_that_are_read_in_two_ways_are_said_in_both():
 def test_a_long_interval_is_set_apart_from_its_unit():
     rows = {"k_z": Estimate(3.27e6, "N/m^3", 3.8e5, interval=(2.85e6, 4.16e6))}
     assert _table("determined by the data", rows, "95 % interval")[1].endswith(
-        " 2.85e+06 to 4.16e+06 N/m^3"
+        " 2850000 to 4160000  N/m^3"
     )
 
 
@@ -205,24 +245,27 @@ MISSED = Adequacy(
 
 
 def test_a_model_that_misses_the_data_prints_none_of_its_numbers():
-    """But what is measured, and of the model's numbers how many times their errors are widened."""
+    """But what is measured, and where the model fails."""
     found = made_result(adequacy=MISSED, chi2_per_bin=5.0, harmonic_p_value=None)
     assert found.adequate is False and found.adequacy_p == 0.001
     words = words_of(str(found))
     in_order = (
         "coefficient of variation 2 %",
-        "The model does not describe the data: chi2 per bin 5.00 (expected 0.86), p",
-        "so no number of the model is shown: report what is measured, and that the model",
-        f"their standard errors are widened by a factor of {np.sqrt(145 / 25):.2g}.",
+        "MODEL slow part + regular rhythm: does NOT fit, p <= 0.001",
+        "The data have more power than the model from 7 to 9 Hz (12.0 standard errors).",
+        "1 other model fitted worse.",
+        "Report what is measured, and that the model does not fit. More: `fit -v`",
     )
     places = [words.index(part) for part in in_order]
     assert places == sorted(places)
     names = {*found.parameters, *found.derived}
-    assert not names & set(words.split()) and "Hz" not in words.partition("so no number")[2]
-    for absent in ("of the model (", "parameters", "do not determine", "AIC", "per newton"):
+    assert not names & set(words.split())
+    for absent in ("half-power", "NOT KNOWN", "AIC", "per newton"):
         assert absent not in words
     heading = "would be determined if the model held (per newton of mean force):"
-    assert heading in words_of(found.details()) and "c_w" in found.details().split()
+    details = words_of(found.details())
+    assert heading in details and "c_w" in found.details().split()
+    assert f"standard errors are widened by a factor of {np.sqrt(145 / 25):.2g}:" in details
 
 
 JUDGED = {
@@ -232,10 +275,10 @@ JUDGED = {
     "failed": {"success": False, "adequacy": None, "chi2_per_bin": None},
 }
 VERDICTS = {
-    "describes": "The model describes the data",
-    "misses": "The model does not describe the data",
-    "unknown": "Whether the model describes the data cannot be judged",
-    "failed": "Not fitted: ",
+    "describes": "MODEL  slow part + regular rhythm: fits",
+    "misses": "MODEL  slow part + regular rhythm: does NOT fit",
+    "unknown": "MODEL  slow part + regular rhythm: cannot be judged",
+    "failed": "MODEL  not fitted: ",
 }
 MEASURED = (
     "mean",
@@ -269,10 +312,16 @@ def test_what_is_measured_is_told_whatever_the_model_says(case, tmp_path):
     found, (_, steady) = of_recordings(**JUDGED[case]), recorded()
     rows = [line for line in str(steady).splitlines() if line.startswith(MEASURED)]
     assert len(rows) == len(MEASURED)
-    for text in (str(found), found.details()):
-        lines = text.splitlines()
-        verdict = next(i for i, line in enumerate(lines) if line.startswith(VERDICTS[case]))
-        assert all(lines.index(f"    {row}") < verdict for row in rows)
+    short, whole = str(found).splitlines(), found.details().splitlines()
+    verdict = next(i for i, line in enumerate(whole) if line.startswith(VERDICTS[case]))
+    assert all(whole.index(f"  {row}") < verdict for row in rows)
+    verdict = next(i for i, line in enumerate(short) if line.startswith(VERDICTS[case]))
+    kept = ("mean", "coefficient of variation")
+    kept += ("  without", "median", "sample", "  size") * (case != "misses")
+    assert all(short.index(f"  {row}") < verdict for row in rows if row.startswith(kept))
+    (tremor,) = (line for line in short if line.startswith("  tremor, 6 to 12 Hz"))
+    seen = steady.measures["tremor_frequency"]
+    assert tremor.split("  ")[-1].strip() == seen.interval_in_words()
     found.save(tmp_path / "fit.json")
     for result in (found, jm.load_result(tmp_path / "fit.json")):
         assert result.measured == steady.measures
@@ -284,8 +333,8 @@ def test_what_is_measured_is_told_whatever_the_model_says(case, tmp_path):
 
 
 def test_of_recordings_few_numbers_of_the_model_are_printed():
-    """The rhythms, the half-power frequency with what is known against it, the bands; and no
-    parameters, since one of several models was chosen for this target alone."""
+    """The rhythms and the half-power frequency, with what is known against it; and no parameters,
+    since one of several models was chosen for this target alone."""
     derived = {
         "resonance_frequency": Estimate(9.28, "Hz", 0.11, interval=(9.1, 9.5)),
         "resonance_share": Estimate(0.0133, "1", 0.0033),
@@ -293,35 +342,43 @@ def test_of_recordings_few_numbers_of_the_model_are_printed():
         "model_mean": Estimate(2.5, "N", None, True, False),
         "band_8_12": Estimate(0.03, "1", 0.003),
     }
-    text = str(of_recordings(derived=derived))
-    rows = [line.split()[:2] for line in text.splitlines()]
-    assert ["resonance_frequency", "9.28"] in rows and ["half_power_frequency", "0.94"] in rows
-    words = words_of(text)
+    words = words_of(str(of_recordings(derived=derived)))
     for part in (
-        "of the model: 95 % interval",
-        "half_power_frequency: beside a strong tremor its interval is too narrow",
-        "power by band, fitted (measured): ",
-        "± is from within the recording",
-        "the model was chosen for this target alone",
-        "the data do not determine: k_w, model_mean",
+        "frequency of the resonance 9.28 ± 0.11 Hz 9.10 to 9.50",
+        "half-power frequency 0.94 ± 0.12 Hz 0.70 to 1.20",
+        "CHECK half-power frequency: beside a strong tremor its interval is too narrow",
+        "± is from within one recording",
+        "the model was chosen for these data alone",
+        "NOT KNOWN from these data: active stiffness",
     ):
         assert part in words
-    for absent in ("c_w", "resonance_share", "parameters", "per newton", "one of many sets"):
+    for absent in ("c_w", "resonance_share", "per newton", "band"):
         assert absent not in words
     quiet = of_recordings(derived={"model_mean": derived["model_mean"]}, ladder=())
-    assert "of the model: 95" not in words_of(str(quiet)) and "chosen" not in str(quiet)
+    assert "half-power" not in str(quiet) and "chosen" not in str(quiet)
+
+
+def test_what_is_known_in_one_way_is_not_called_unknown():
+    """Without the passive stiffness that is stated, both are one word."""
+    loose = ["k_w", "K_w0", "k_z", "c_z", "resonance_width", "model_mean", "fibre_length@a"]
+    assert unknown_kinds(loose, ["K_z0", "resonance_frequency"]) == [
+        "active stiffness",
+        "passive damping",
+        "fibre_length",
+    ]
+    assert sorted(unknown_kinds(["k_z", "c_w", "K_w0"], [])) == ["active damping", "stiffness"]
 
 
 def test_where_the_scatter_is_unknown_there_is_no_verdict_but_there_are_numbers():
     unknown = made_result(adequacy=None, chi2_per_bin=None)
     words = words_of(str(unknown))
-    assert unknown.adequate is None and "the data cannot be judged: the target" in words
-    assert "parameters (per newton of mean force): c_w" in words
+    assert unknown.adequate is None and "cannot be judged: the target" in words
+    assert "c_w 6.667 ± 0.013" in words
 
 
 def test_text_fits_a_terminal():
     """Also with long sentences: nothing is lost, and what goes on is further in."""
-    text = str(made_result(notices=("word " * 40,), message="a long message " * 10))
+    text = made_result(notices=("word " * 40,), message="a long message " * 10).details()
     assert max(map(len, text.splitlines())) <= 80 and text.count("word") == 40
     assert all(
         line.startswith("    word") for line in text.splitlines() if line.strip().startswith("word")
@@ -333,4 +390,4 @@ def test_text_fits_a_terminal():
 def test_of_a_fit_that_failed_no_number_of_the_model_is_printed():
     text = str(failed_result())
     assert "not fitted" in text.lower()
-    assert "parameters" not in text and "of the model" not in text and "one of many" not in text
+    assert "half-power" not in text and "NOT KNOWN" not in text

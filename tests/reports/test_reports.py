@@ -50,7 +50,7 @@ def test_of_a_fit(tmp_path):
         for words in ("What the data determine", "What the data do not determine", "What was fixed")
     )
     first, second = text.split("What the data do not determine", 1)
-    assert "corner_frequency | 0.333 ± 0.010 | above 0.31 | Hz" in first
+    assert "corner_frequency | 0.333 ± 0.010 | above 0.310 | Hz" in first
     assert (
         "What to know about this fit" in first
         and "k_w" not in first.split("What to know about this fit")[0]
@@ -61,8 +61,8 @@ def test_of_a_fit(tmp_path):
     assert "dt | 0.0025" in text and "jaxmuscle 0.1, jax 0.8" in text
     tried = text.split("Models tried", 1)[1]
     assert (
-        "0 | base | 1.90 | 0.002 | -250.1 | 1 | with activation | 0.90 | 0.3 | -260.0 | the result"
-        in tried
+        "0 | slow part + regular rhythm | 1.90 | 0.002 | -250.1 |"
+        " 1 | slow part + twitch + regular rhythm | 0.90 | 0.3 | -260.0 | the result" in tried
     )
     assert sum(tag == "img" for tag, _ in seen.elements) == 1
     assert (

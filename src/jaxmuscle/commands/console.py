@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 CONVERGED, NOT_CONVERGED = 0, 1
 REACHED = "reached.toml"
+VERDICT = "MODEL"
 
 out = Console(soft_wrap=False, highlight=False)
 # a message is one line of a log
@@ -157,10 +158,12 @@ def say_written(folder: Path, *names: str) -> None:
 
 
 def show(result: object, *, success: bool) -> None:
-    """A result as it prints itself, its first line in colour."""
-    first, *rest = str(result).splitlines()
-    out.print(f"[{'green' if success else 'bold red'}]{plain(first)}[/]", soft_wrap=True)
-    out.print("\n".join(map(plain, rest)), soft_wrap=True)
+    """A result as it prints itself; the line of its verdict, else its first one, in colour."""
+    lines = str(result).splitlines()
+    verdict = next((i for i, line in enumerate(lines) if line.startswith(VERDICT)), 0)
+    for i, line in enumerate(lines):
+        colour = f"[{'green' if success else 'bold red'}]" * (i == verdict)
+        out.print(f"{colour}{plain(line)}{'[/]' * bool(colour)}", soft_wrap=True)
 
 
 SPECTRUM = "spectrum.csv"  # of several commands

@@ -19,7 +19,6 @@ from .console import (
     aimed,
     err,
     fit_files,
-    out,
     plain,
     record,
     reporting,
@@ -99,8 +98,9 @@ def fit(
             min=0,
             max=3,
             help=(
-                "Richest model that may be tried: 0 base, 1 with activation, 2 with a resonance, 3"
-                " with a second one. If you give several spectra, all get exactly this model."
+                "Richest model that may be tried: 0 slow part + regular rhythm, 1 with twitch, 2"
+                " slow part + twitch + resonance, 3 with two resonances. If you give several"
+                " spectra, all get exactly this model."
             ),
         ),
     ] = None,
@@ -110,8 +110,8 @@ def fit(
             min=0,
             max=3,
             help=(
-                "Fit just this model: 0 base, 1 with activation, 2 with a resonance, 3 with a"
-                " second one."
+                "Fit just this model: 0 slow part + regular rhythm, 1 with twitch, 2 slow part +"
+                " twitch + resonance, 3 with two resonances."
             ),
         ),
     ] = None,
@@ -176,10 +176,11 @@ def fit(
             ),
         ),
     ] = False,
-    everything: Annotated[
+    verbose: Annotated[
         bool,
         typer.Option(
-            "--all",
+            "--verbose",
+            "-v",
             help=(
                 "Print all numbers of the model, too: parameters, what the data do not determine,"
                 " the models that were tried."
@@ -257,8 +258,8 @@ def fit(
             from .cohort import fit_together
 
             unused(reading, "axis", "quantity", window=window, what="recordings; these are spectra")
-            if everything:
-                raise ValueError("--all: of several spectra all numbers are in cohort.csv")
+            if verbose:
+                raise ValueError("--verbose: of several spectra all numbers are in cohort.csv")
             if method != MethodName.linear or seeds is not None or quick:
                 raise ValueError(
                     "several spectra are fitted in one go, without simulation: leave out --method,"
@@ -317,7 +318,7 @@ def fit(
                 model = jm.model.on_rung(model, rung)
             asked = partial(jm.fit, model, seen, **options)
             called = seen[0].name if isinstance(seen, list) else seen.name
-        converged = _fit_one(asked, called, output, figures, everything=everything)
+        converged = _fit_one(asked, called, output, figures, verbose=verbose)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
@@ -360,7 +361,7 @@ def _check_rung(
         )
     if rung and noise is not None:
         raise ValueError(
-            "--rung: the models with activation and resonance have noise of their own; leave out"
+            "--rung: the models with twitch and resonance have noise of their own; leave out"
             " --noise"
         )
 
@@ -424,21 +425,19 @@ def _fit_one(
     folder: Path,
     formats: list[str],
     *,
-    everything: bool,
+    verbose: bool,
 ) -> bool:
-    """The table as soon as the search has ended, then what the checks add; the fit is written
-    before these."""
-    printed = []
-
-    def table(result: Any) -> None:
-        text = result.details() if everything else result
-        show(text, success=result.success and result.adequate is not False)
-        printed.append(result)
+    """Fit, write, print; the fit is written as soon as the search has ended, before its checks."""
+    reached = []
 
     def answer(result: Any) -> None:
-        table(result)
         write_fit(result, folder)  # a program of the checks may run longer than a signal can wait
-        stays(STAYS)
+        reached.append(result)
+        stays(f"{STAYS}; not checked: {folder / 'fit.json'}")
+
+    def say(result: Any) -> None:
+        text = result.details() if verbose else result
+        show(text, success=result.success and result.adequate is not False)
 
     stays(NOTHING)
     try:
@@ -447,40 +446,21 @@ def _fit_one(
             tell("writing", 1.0)
             files = write_fit(result, folder, formats, report=True)
     except jm.fits.FitInterrupted as stop:
-        if not printed:
+        if not reached:
             write_reached(stop, folder)
         write_fit(stop.result, folder)
         record(folder / "fit.json")
+        say(stop.result)
         err.print(f"interrupted: what had been reached is in {plain(folder)}")
         raise typer.Exit(interrupted()) from None
     except KeyboardInterrupt:
-        if printed:
+        if reached:
             raise
         with contextlib.suppress(OSError):
             folder.rmdir()  # made for this fit, and empty
         err.print(f"interrupted: {NOTHING}")
         raise typer.Exit(interrupted()) from None
     record(folder / "fit.json")
-    if not printed:
-        table(result)
-    told_before = {*printed[0].remarks, *printed[0].notices}
-    new = [
-        sentence
-        for sentence in (*result.remarks, *(f"note: {notice}" for notice in result.notices))
-        if sentence.removeprefix("note: ") not in told_before
-    ]
-    for sentence in new:
-        out.print(plain(sentence))
-    if new and _numbers(printed[0]) != _numbers(result):
-        out.print(
-            "The checks moved the last digits a little: cite the numbers in the files.",
-        )
+    say(result)
     say_written(folder, *files)
     return result.success
-
-
-def _numbers(result: Any) -> dict[str, tuple[str, str]]:
-    """The numbers of a fit as it prints them."""
-    return {
-        n: (p.in_words(), p.interval_in_words()) for n, p in result.as_shown(result.found).items()
-    }

@@ -50,9 +50,9 @@ def study(
         str | None,
         typer.Option(
             help=(
-                "Model for all people: 0 base, 1 with activation, 2 with a resonance, 3 with a"
-                " second one; or auto: the one with the lowest AIC. By default 3 where everybody"
-                " has five trials in every condition, else 2."
+                "Model for all people: 0 slow part + regular rhythm, 1 with twitch, 2 slow part +"
+                " twitch + resonance, 3 with two resonances; or auto: the one with the lowest AIC."
+                " By default 3 where everybody has five trials in every condition, else 2."
             )
         ),
     ] = None,

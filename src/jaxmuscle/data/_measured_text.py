@@ -57,13 +57,24 @@ def measured_lines(measures: Measures, band: tuple[float, float]) -> list[str]:
     return lines + tremor_lines(measures, band)
 
 
-def tremor_lines(measures: Measures, band: tuple[float, float]) -> list[str]:
-    """Whether there is one; its frequency and size, or the size that would have shown."""
+def tremor_lines(
+    measures: Measures, band: tuple[float, float], *, short: bool = False
+) -> list[str]:
+    """Whether there is one; its frequency and size, or the size that would have shown; `short`,
+    without the p-value of one that is seen."""
     p, seen = measures["tremor_p"].value, measures["tremor_frequency"]
     first = TREMOR["tremor_p"].format(*band)
+    of = " over the mean" * (measures["tremor_detectable"].unit == "1")
+    if short and not math.isfinite(seen.value):
+        least = measures["tremor_detectable"]
+        told = measured_line("", "tremor_detectable", least).strip()
+        would = f"; {told} would show" * math.isfinite(least.value)
+        return [f"{first:<{WIDE}}none seen, {probability(p)}{would}"]
+    if short:
+        rows = {"tremor_frequency": first, "tremor_size": TREMOR["tremor_size"].format(of)}
+        return [measured_line(words, name, measures[name]) for name, words in rows.items()]
     here = math.isfinite(seen.value)
     lines = [f"{first:<{WIDE}}{'seen' if here else 'none seen'}, {probability(p)}"]
-    of = " over the mean" * (measures["tremor_detectable"].unit == "1")
     for name in list(TREMOR)[1:3] if here else list(TREMOR)[3:]:
         if math.isfinite(measures[name].value):
             lines.append(measured_line(TREMOR[name].format(of), name, measures[name]))

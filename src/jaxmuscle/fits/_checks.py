@@ -37,6 +37,7 @@ from ._stages import Stage, expand_at_best
 
 AMBIGUOUS, OTHER = 2.0, 3.0
 SAME_MINIMUM = 0.5  # of costs
+CONVERGED = "converged: "  # how the message of a fit that did begins
 # how starts began, in words
 BEGAN = {
     PEAK: "from peaks",
@@ -240,7 +241,7 @@ def convergence(
     )
     if final.settled[final.best] or gain < SMALL:
         if len(kinds) > 1 or len(starts) == 1:
-            return True, f"converged: {census}"
+            return True, f"{CONVERGED}{census}"
         times = "once" if len(there) == 1 else f"{len(there)} times, by one kind of start"
         return True, (
             f"best of {len(starts)} starts, found {times} ({BEGAN[there[0]]}): a better minimum may"

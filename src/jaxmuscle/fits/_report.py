@@ -383,9 +383,6 @@ def report_fit(
         notices=(
             *notices,
             *ended.judged[1],
-            *other,
-            *why,
-            *twitch_notices(derived),
             *mass_notices(problem.coordinates, theta),
             *array_notices(tasks),
             *reach_notices(derived, parts),
@@ -394,6 +391,7 @@ def report_fit(
             *unsimulated(plan, stages),
             *beyond,
         ),
+        unstated=(*other, *why, *twitch_notices(derived)),
         **common,
     )
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-FORMAT = 5
+FORMAT = 6
 ADEQUATE = 0.01  # p of the verdict from which on a model describes the data
 
 Number = float | None  # null where it is not finite
@@ -99,7 +99,10 @@ class Rung(Table):
 
     number: Annotated[
         Annotated[int, Meta(ge=-1)],
-        says("-1 noise alone, 0 base, 1 activation, 2 resonance, 3 two resonances"),
+        says(
+            "-1 slow part alone, 0 with a regular rhythm, 1 also with twitch, 2 with twitch and a"
+            " resonance, 3 with twitch and two"
+        ),
     ]
     model: Annotated[str, says("The model in words")]
     aic: Annotated[float, says("-2 ln L + 2 parameters")]
@@ -292,7 +295,7 @@ class PartTable(Table, kw_only=True):
 class FitTable(Table, kw_only=True):
     """The keys of a fit."""
 
-    format: Annotated[Literal[5], says("Version of the format")]
+    format: Annotated[Literal[6], says("Version of the format")]
     success: Annotated[bool, says("Whether the search converged")]
     message: Annotated[str, says("How the search ended")]
     adequate: Annotated[
@@ -323,7 +326,10 @@ class FitTable(Table, kw_only=True):
     harmonic_p_value: Annotated[
         Share | None, says("p-value of the harmonic: how often chance makes one as strong")
     ]
-    notices: Annotated[tuple[str, ...], says("Notes on the fit")]
+    notices: Annotated[tuple[str, ...], says("Notes on the data and the fit")]
+    unstated: Annotated[
+        tuple[str, ...], says("Why a number of the model has no error, or is not to be reported")
+    ]
     seed: Annotated[
         Annotated[int, Meta(ge=0, lt=SEEDS)] | None,
         says("The random key (`key=`, `--seed`), if it was a whole number; else null"),
@@ -403,18 +409,14 @@ class Estimate(Shown, eqx.Module):
         """The 95 % interval, empty where there is none."""
         if self.interval is None:
             return ""
-        low, high = ("" if end is None else f"{end:.{self._digits(end)}g}" for end in self.interval)
+        ends = [end for end in self.interval if end is not None]
+        # of an interval that is narrower than the error says, as many places as tell its ends apart
+        narrow = (ends[1] - ends[0]) / 4 if len(ends) == 2 else math.inf
+        error = min(narrow, self.stderr or math.nan)
+        low, high = ("" if end is None else rounded(end, error)[0] for end in self.interval)
         if low and high:
             return f"{low} to {high}"
         return f"above {low}" if low else f"below {high}" if high else "open"
-
-    def _digits(self, end: float) -> int:
-        """Three significant digits of an end of the interval, or more where both ends would else
-        look the same."""
-        low, high = self.interval or (None, None)
-        if low is None or high is None or end == 0 or not 0 < high - low < math.inf:
-            return 3
-        return max(3, math.floor(math.log10(abs(end))) - math.floor(math.log10(high - low)) + 1)
 
 
 class FittedPart(eqx.Module):
@@ -643,6 +645,7 @@ SAME = (
     "undetermined",
     "harmonic_p_value",
     "notices",
+    "unstated",
     "seed",
     "versions",
 )
@@ -664,7 +667,8 @@ class FitResult(Result, eqx.Module):
     (residuals in standard deviations, parameters in the prior's); the table of `starts`; `profile`,
     harmonic frequencies [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`,
     how often spectra without harmonic would show one as strong (both None with several targets);
-    `notices`; `seed`; `settings`; `versions`. An `Adequacy`, a `Rung` and a `Start` have as
+    `notices` on the data and the fit, and `unstated`, why a number has no error or is not to be
+    reported; `seed`; `settings`; `versions`. An `Adequacy`, a `Rung` and a `Start` have as
     attributes what docs/reference/files.md lists for `adequacy`, `ladder` and `starts`. A fit of
     one target has what its part has as its own: `task`, `target`, `chi2_per_bin`, `fitted` and so
     on.
@@ -685,6 +689,7 @@ class FitResult(Result, eqx.Module):
     profile: tuple[np.ndarray, np.ndarray] | None
     harmonic_p_value: float | None
     notices: tuple[str, ...]
+    unstated: tuple[str, ...]
     seed: int | None
     settings: dict[str, Any]
     versions: dict[str, str]
@@ -703,14 +708,13 @@ class FitResult(Result, eqx.Module):
         """The measured quantity, parameter or derived quantity of that name, with its `value`,
         `stderr`, `interval` and `unit`.
 
-        Where no mean force in newtons was given, these are newtons of the model muscle, and print
-        shows forces, masses, stiffness and damping divided by its mean force,
-        `result["model_mean"].value`, as the person's are unknown. `per_newton` and
-        `as_shown(result.found)` give what is shown.
+        Where no mean force in newtons was given, forces, masses, stiffness and damping are per
+        newton of mean force, as the scale of force is unknown. `parameters` and `derived` have the
+        numbers of the fitted `task`.
 
         Raises `ValueError` for an unknown name.
         """
-        known = self.parameters | self.derived | self.measured
+        known = self.as_shown(self.parameters | self.derived) | self.measured
         if name not in known:
             raise ValueError(
                 f"unknown quantity {name!r} of the fit of {self.title}: {choices(name, known)}"
@@ -742,7 +746,7 @@ class FitResult(Result, eqx.Module):
         ]
         rows += [
             {"quantity": name, "kind": "parameter" if name in own else "derived", **p.row()}
-            for name, p in once(self.parameters, self.derived).items()
+            for name, p in self.as_shown(once(self.parameters, self.derived)).items()
         ]
         return frame(rows)
 
@@ -895,7 +899,7 @@ class FitResult(Result, eqx.Module):
     def details(self) -> str:
         """As text all that it found: also models that were tried, parameters, what the data do not
         determine."""
-        return load_above("reports").fit_text(self, everything=True)
+        return load_above("reports").fit_details(self)
 
     def methods(self) -> str | None:
         """A paragraph for the methods section of a paper; None for several targets, a moved

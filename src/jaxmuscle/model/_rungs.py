@@ -5,26 +5,38 @@ from ._parameters import default
 from ._resonant_noise import ResonantNoise
 from ._tasks import AbstractTask
 
+SLOW, TWITCH, LINE, RESONANCE = "slow part", "twitch", "regular rhythm", "resonance"
+# as `model_name` calls what `on_rung` makes
 RUNGS = (
-    "base: noise and a harmonic",
-    "with activation",
-    "with a resonance instead of the harmonic",
-    "with a second resonance",
+    f"{SLOW} + {LINE}",
+    f"{SLOW} + {TWITCH} + {LINE}",
+    f"{SLOW} + {TWITCH} + {RESONANCE}",
+    f"{SLOW} + {TWITCH} + two {RESONANCE}s",
 )
 # what a comparison calls them, with the task's own noise
 RICHER = {"activation": 1, "resonance": 2, "two resonances": 3}
-QUIET, NOISE_ALONE = -1, "noise alone"  # below the base model
+QUIET = -1  # below the base model, without a rhythm
 
 
 def rung_name(rung: int) -> str:
     """A model of the ladder in words."""
-    return NOISE_ALONE if rung == QUIET else RUNGS[rung]
+    return f"{SLOW} alone" if rung == QUIET else RUNGS[rung]
+
+
+def model_name(task: AbstractTask) -> str:
+    """What the force of a task is made of, in words: the muscle's answer to its noise (the slow
+    part), the twitch of an activation, a harmonic (a regular rhythm), resonances."""
+    count = sum(isinstance(noise, ResonantNoise) for noise in task.noise.components)
+    parts = [SLOW, *[TWITCH] * (task.activation is not None)]
+    parts += [LINE] * (float(task.harmonic.amplitude) != 0)
+    parts += [RESONANCE, f"two {RESONANCE}s"][count - 1 : count] if count else []
+    return " + ".join(parts) if len(parts) > 1 else f"{SLOW} alone"
 
 
 def on_rung(task: AbstractTask, rung: int) -> AbstractTask:
     """The task with what measured force asks for beyond the base model, by `rung`:
 
-        task = jm.model.on_rung(jm.Isometric(), 2)  # with activation and a resonance
+        task = jm.model.on_rung(jm.Isometric(), 2)  # slow part + twitch + resonance
         task["resonance_frequency"]
 
     0, as it is; 1, with an `Activation` between the nervous drive and the active tissue; 2, with a

@@ -2,6 +2,7 @@
 
 from ._cohort_text import cohort_card as cohort_card
 from ._fit_text import fit_card as fit_card
+from ._fit_text import fit_details as fit_details
 from ._fit_text import fit_text as fit_text
 from ._methods import fit_methods as fit_methods
 from ._methods import study_methods as study_methods

@@ -1,45 +1,84 @@
 """The result of a fit as text, and as a table in a notebook."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from jaxmuscle._common.cards import Card
-from jaxmuscle._common.text import folded
+from jaxmuscle._common.text import WIDTH, folded, probability
 from jaxmuscle.data._measured import is_recorded, tremor_band
-from jaxmuscle.data._measured_text import REGULAR, TREMOR, WORDS, measured_line, tremor_lines
+from jaxmuscle.data._measured_text import (
+    REGULAR,
+    TREMOR,
+    WIDE,
+    WORDS,
+    measured_line,
+    tremor_lines,
+)
+from jaxmuscle.data._recording import FOUND, UNRAMPED
 from jaxmuscle.data._target import Target
+from jaxmuscle.fits._checks import CONVERGED
 from jaxmuscle.fits._result import RELATIVE, Estimate, FitResult, FittedPart, once
 from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.model._rungs import model_name
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._derived import MEAN, MEANINGS, VARIATION
-from jaxmuscle.spectra._bin_law import ENOUGH
+from jaxmuscle.objective._derived import MEANINGS, VARIATION
+from jaxmuscle.spectra._bin_law import ENOUGH, trial_samples
 from jaxmuscle.spectra._fluctuations import BANDS, in_bands
 
 from ._ladder_text import explain_choice, ladder_table
 
 LENGTHS = ("x_ref_w", "x_ref_z")
 OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
+INDENT = 2
+HALF_POWER = "half_power_frequency"
 BROAD = 1.7 * 3.92  # standard errors: an interval that is wider than theirs
-# measured numbers that a fit prints, in words
-SHOWN = {
+# measured numbers in words: all that a fit prints, those of its short text, and those that are left
+# there where the model does not fit
+ALL = {
     **{name: words for name, words in WORDS.items() if not name.endswith("_above_0.5")},
     "relative_power_4_8": "power 4-8 Hz, 1e-6 mean²",
     "relative_power_8_12": "power 8-12 Hz, 1e-6 mean²",
     **{name: REGULAR[name] for name in ("median_frequency", "sample_entropy")},
 }
-HALF_POWER = "half_power_frequency"
-STATED = ("resonance_frequency", "resonance_2_frequency", "harmonic_frequency", HALF_POWER)
-CAVEAT = "beside a strong tremor its interval is too narrow"
-WITHIN = "± is from within the recording: between trials of one person we saw about twice as much"
+SHOWN = {name: words for name, words in ALL.items() if name != "standard_deviation"}
+FEW = {n: SHOWN[n] for n in ("mean", "coefficient_of_variation", "relative_power_8_12")}
+# numbers of the model that it prints, in words: of a held force, and of a moved limb
+RHYTHMS = {
+    "resonance_frequency": "frequency of the resonance",
+    "resonance_2_frequency": "frequency of the second one",
+    "harmonic_frequency": "frequency of the rhythm",
+    HALF_POWER: "half-power frequency",
+}
+STIFFNESS = ("tangent_stiffness", "K_w_tangent", "K_z0", "C_w0", "C_z0")
+# what a number that the data do not determine belongs to, by the beginning of its name
+KINDS = {
+    "active stiffness": ("k_w", "K_w"),
+    "passive stiffness": ("k_z", "K_z"),
+    "active damping": ("c_w", "C_w"),
+    "passive damping": ("c_z", "C_z"),
+    "stiffness of both tissues": ("tangent_stiffness",),
+    "mass": ("m_",),
+    "lengths": ("x_ref",),
+    "nervous drive": ("P_w",),
+    "noise": ("noise_",),
+    "twitch": ("activation_time", "contraction_time"),
+    "corner frequency": ("corner_frequency",),
+    "half-power frequency": ("half_power_frequency",),
+    "regular rhythm": ("harmonic_",),
+    "resonance": ("resonance_",),
+    "": ("model_", *BANDS),  # these are measured
+}
+MOST = 3  # checks that are printed
+CAVEAT = "half-power frequency: beside a strong tremor its interval is too narrow"
+WITHIN = "± is from within one recording; between trials we saw about twice as much"
 CHOSEN = (
-    "the model was chosen for this target alone: do not compare its numbers between fits;"
-    " `jaxmuscle study` fits all people with one model"
+    "the model was chosen for these data alone: `jaxmuscle study` fits all people with one model"
 )
-EVERYTHING = (
-    "all other numbers of the model: `jaxmuscle fit --all`, fit.json; in Python result.details()"
-)
+IN_SERIES = "active and passive tissue in series"  # where no spectrum was fitted
+REPORT = "Report what is measured, and that the model does not fit. More: `fit -v`"
+EVERYTHING = "everything else: `jaxmuscle fit -v`, fit.json; in Python result.details()"
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 
 
@@ -68,6 +107,7 @@ def fit_card(result: FitResult) -> Card:
         *_choice(result),
         *result.advice,
         *result.notices,
+        *result.unstated,
         *result.remarks,
         *_held(result),
     )
@@ -82,53 +122,192 @@ def _heading(result: FitResult) -> str:
     return f"{subject} {result.verdict}"
 
 
-def fit_text(result: FitResult, *, everything: bool = False) -> str:
-    """What is measured, whether the model describes it, and what then is known of the model: of
-    recordings its rhythms, of a spectrum its parameters; or everything.
+def fit_text(result: FitResult) -> str:
+    """What was read, what is measured, whether the model describes it, what then is known of the
+    model, and what is not; at most 24 lines for one target, 12 where the model does not fit.
 
-    The numbers of a model that does not describe the data are shown with everything only.
+    The numbers of a model that does not describe the data are left to `fit_details`.
     """
-    lines = [_head(result), *_measured(result), _heading(result)]
+    missed = result.success and result.adequate is False
+    lines = [line for name, part in result.parts.items() for line in _read(result, name, part)]
+    for name, part in result.parts.items():
+        words = FEW if missed or part.stiffness is not None else SHOWN
+        if len(result.parts) > 1:
+            words = {n: FEW[n] for n in ("mean", "coefficient_of_variation")}
+        lines += _measured(result, name, part, words, short=True)
+    lines += _judged(result)
+    if result.success and not missed:
+        lines += _results(result)
+    lines += _checks(result, MOST if len(result.parts) == 1 and not missed else 1)
+    return folded([*lines, *[EVERYTHING] * (not missed)])
+
+
+def _read(result: FitResult, name: str, part: FittedPart) -> list[str]:
+    """The data in a line: name, trials, quantity, length; of a moved one also its response."""
+    target, called = part.target, part.target.name
+    if len(result.parts) > 1 and name != called:
+        called = f"{name}: {called}"
+    bins, found = len(target.bins), []
+    if bins and is_recorded(target.measured):
+        count, seconds = len(target.segments or ()), trial_samples(target) / target.settings.rate
+        unit = "" if target.unit is None else f" ({target.unit})"
+        each = " each" * (count > 1)
+        found.append(f"{'1 trial' if count == 1 else f'{count} trials'} of {target.quantity}{unit}")
+        chosen = any(notice.startswith(FOUND) for notice in target.notices)
+        found.append(f"{seconds:.1f} s{each}{', found automatically' * chosen}")
+    elif bins:
+        found.append(f"spectrum of {target.quantity} ({target.provenance}), {bins} bins")
+        if target.segments is not None:
+            found.append(f"{sum(target.segments)} segments")
+    if part.stiffness is not None and target.stiffness is not None:
+        f = target.stiffness.known.frequency
+        found.append(f"dynamic stiffness, {f[0]:.2g} to {f[-1]:.2g} Hz")
+    return [f"{called}   {', '.join(found)}"]
+
+
+def _measured(
+    result: FitResult, name: str, part: FittedPart, words: Mapping[str, str], *, short: bool
+) -> list[str]:
+    """Measured numbers of one target by these words, then its tremor."""
+    found = part.target.measured
+    rows = [measured_line(said, key, found[key]) for key, said in words.items() if key in found]
+    if found.keys() >= TREMOR.keys():
+        lines = tremor_lines(found, tremor_band(part.target.quantity), short=short)
+        rows += lines[: 1 if len(words) <= len(FEW) else None]
+    if not rows:
+        return []
+    of = f" of {name}" * (len(result.parts) > 1)
+    return [
+        f"{f'MEASURED{of}':<{INDENT + WIDE + 25}} 95 % interval",
+        *(f"{'':{INDENT}}{row}" for row in rows),
+    ]
+
+
+def _judged(result: FitResult) -> list[str]:
+    """The model, and whether it describes the data."""
+    if not result.success:
+        return [f"MODEL  {result.verdict}"]
+    parts = [part for part in result.parts.values() if part.fitted.size]
+    name = " and ".join(dict.fromkeys(model_name(part.task) for part in parts)) or IN_SERIES
+    verdict = result.adequacy
+    if verdict is None:
+        return [f"MODEL  {name}: {result.verdict}"]
+    if verdict.adequate:
+        return [f"MODEL  {name}: fits, {probability(verdict.p)}"]
+    others = len(result.ladder) - 1
+    tried = f" {others} other model{'s' * (others > 1)} fitted worse." * (others > 0)
+    return [
+        f"MODEL  {name}: does NOT fit, {probability(verdict.p)}",
+        f"  {verdict.misfit[0].upper()}{verdict.misfit[1:]}.{tried}",
+        f"  {REPORT}",
+    ]
+
+
+def _results(result: FitResult) -> list[str]:
+    """What is known of the model, in rows, and what these data do not tell."""
+    every, shown = result.as_shown(result.found), result.as_shown(result.determined)
+    recorded = any(is_recorded(part.target.measured) for part in result.parts.values())
+    several = len(result.parts) > 1
+    moved = any(part.stiffness is not None for part in result.parts.values())
+    stated = (*RHYTHMS, *STIFFNESS * moved)
+    rows = {
+        name: p
+        for name, p in shown.items()
+        if base_of(name) in stated
+        or ((several or not recorded) and not moved and name in result.free)
+        or (base_of(name) not in {*PARAMETERS, *MEANINGS})  # of an own muscle
+    }
+    lines = []
+    if (p := result.harmonic_p_value) is not None:
+        seen = "seen" if p < 0.05 else "none seen"
+        lines.append(f"  {'regular rhythm (harmonic)':<{WIDE}}{seen}, {probability(p)}")
+    for name, p in rows.items():
+        base, at, target = name.partition("@")
+        words = RHYTHMS.get(base, base) + f", {target}" * bool(at)
+        unit = f" {p.unit}" * (p.unit not in ("1", ""))
+        line = f"  {words:<{WIDE}}{p.in_words() + unit:<25} {p.interval_in_words()}"
+        lines.append(line.rstrip())
+    lines += [f"   {_per_newton(result, rows)}"] * bool(_per_newton(result, rows))
+    if recorded and len(result.ladder) > 1:
+        lines.append(f"  {CHOSEN}")
+    loose = [n for n, p in every.items() if p.stderr is None and p.free]
+    if unknown := unknown_kinds(loose, rows):
+        lines.append(f"NOT KNOWN from these data: {', '.join(unknown)}")
+        lines.append("  `jaxmuscle identifiability fit.json` says what would tell")
+    return lines
+
+
+def unknown_kinds(loose: Iterable[str], known: Iterable[str]) -> list[str]:
+    """What loose quantities belong to, in words, each once, without those of known ones; a quantity
+    of an own muscle by its name."""
+    found, stated = dict.fromkeys(map(_kind, loose)), {"", *map(_kind, known)}
+    words = [kind for kind in found if kind not in stated]
+    for what in ("stiffness", "damping"):
+        if {f"active {what}", f"passive {what}"} <= set(words):
+            words[words.index(f"active {what}")] = what
+            words.remove(f"passive {what}")
+    return words
+
+
+def _kind(name: str) -> str:
+    base = base_of(name)
+    return next((kind for kind, begins in KINDS.items() if base.startswith(begins)), base)
+
+
+def _checks(result: FitResult, most: int) -> list[str]:
+    """The first sentences of what should be looked at, so many; and how many more there are."""
+    within = any(map(_is_within, result.parts.values()))
+    known = {base_of(name) for name in result.determined}
+    narrow = HALF_POWER in known and (_trembles(result) or "resonance_share" in known)
+    narrow = narrow and result.adequate is not False
+    poor = [] if not result.success or result.message.startswith(CONVERGED) else [result.message]
+    # the windows stand in the first line
+    seen = [n for n in result.notices if FOUND not in n and UNRAMPED not in n]
+    said = [
+        _in_short(sentence) for sentence in (*poor, *[CAVEAT] * narrow, *seen, *[WITHIN] * within)
+    ]
+    more = f" ({len(said) - most} more)" * (len(said) > most)
+    lines = [f"CHECK  {sentence}" for sentence in said[:most]]
+    return [*lines[:-1], f"{lines[-1]}{more}"] if lines else []
+
+
+def _in_short(notice: str) -> str:
+    """Its first sentence; of a long one what stands before its last colon, if that says enough."""
+    first = notice.partition(". ")[0]
+    before = first.rpartition(": ")[0]
+    return before if len(first) > WIDTH - len("CHECK  ") and len(before) > WIDTH / 3 else first
+
+
+def _is_within(part: FittedPart) -> bool:
+    """Whether trials are too few for errors from what differs between them."""
+    return is_recorded(part.target.measured) and len(part.target.segments or ()) < ENOUGH
+
+
+def fit_details(result: FitResult) -> str:
+    """All that is measured and all that the fit found: also the models that were tried, every
+    parameter, what the data do not determine and what they leave open."""
+    lines = [_head(result)]
+    for name, part in result.parts.items():
+        lines += _measured(result, name, part, ALL, short=False)
+        if _is_within(part):
+            lines.append(f"  {WITHIN}")
+    lines += _judged(result)
+    if result.adequacy is not None:
+        lines.append(
+            f"  {result.closeness} (expected {result.adequacy.expected / result.data:.2f})"
+        )
     lines += [f"  {result.message}"] * result.success
-    if everything:
-        lines += [f"  {row}" for row in ladder_table(result.ladder, _datum(result))]
-        lines += [f"  {sentence}" for sentence in _choice(result)]
+    lines += [f"  {row}" for row in ladder_table(result.ladder, _datum(result))]
+    lines += [f"  {sentence}" for sentence in _choice(result)]
     lines += _fitted_targets(result)
-    if not everything:
-        lines += [f"  {sentence}" for sentence in result.advice]
-    elif result.adequacy is not None and result.adequate is False:
+    if result.adequacy is not None and result.adequate is False:
         factor = result.adequacy.widening
         lines.append(
             f"  standard errors are widened by a factor of {factor:.2g}: it misses the data"
         )
-    # the short text has no contraction time
-    notices = [n for n in result.notices if everything or not n.startswith("contraction_time")]
-    lines += [f"  note: {notice}" for notice in notices]
+    lines += [f"  note: {notice}" for notice in (*result.notices, *result.unstated)]
     lines += [f"  {sentence}" for sentence in result.remarks]
-    if everything or (result.success and result.adequate is not False):
-        whole = everything or len(result.parts) > 1 or result.only.stiffness is not None
-        lines += _whole_model(result, everything) if whole else _short_model(result)
-    return folded(lines)
-
-
-def _measured(result: FitResult) -> list[str]:
-    """The measured numbers that people state, of every target."""
-    lines, several = [], len(result.parts) > 1
-    for name, part in result.parts.items():
-        target, found = part.target, part.target.measured
-        if not found:
-            continue
-        of = f" of {name}" * several
-        lines.append(f"{f'  measured{of}, without the model:':<56} 95 % interval")
-        rows = [
-            measured_line(words, key, found[key]) for key, words in SHOWN.items() if key in found
-        ]
-        if found.keys() >= TREMOR.keys():
-            rows += tremor_lines(found, tremor_band(target.quantity))
-        lines += [f"    {row}" for row in rows]
-        if is_recorded(found) and len(target.segments or ()) < ENOUGH:
-            lines.append(f"    {WITHIN}")
-    return lines
+    return folded([*lines, *_whole_model(result)])
 
 
 def _fitted_targets(result: FitResult) -> list[str]:
@@ -155,48 +334,17 @@ def _fitted_targets(result: FitResult) -> list[str]:
     return lines
 
 
-def _short_model(result: FitResult) -> list[str]:
-    """The rhythms, and where half of the power is let through; of a spectrum without recordings
-    also the parameters."""
-    every, shown = result.as_shown(result.found), result.as_shown(result.determined)
-    rows = {name: p for name, p in shown.items() if base_of(name) in STATED}
-    lines = _table("of the model", rows, " 95 % interval") if rows else []
-    if HALF_POWER in rows and ("resonance_share" in every or _trembles(result)):
-        lines.append(f"  {HALF_POWER}: {CAVEAT}")
-    bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
-    lines += [f"  {sentence}" for sentence in _by_band(result, bands)]
-    if not is_recorded(result.target.measured):
-        own = {n: p for n, p in every.items() if n in result.free and n not in rows}
-        known = [_in_short(n, p) for n, p in own.items() if p.stderr is not None]
-        loose = [_in_short(n, p) for n, p in own.items() if p.stderr is None]
-        of = _per_newton(result, own)
-        lines += [f"  parameters{of}: {', '.join(known)}"] * bool(known)
-        lines += [f"  not determined, one of many sets that fit{of}: {', '.join(loose)}"] * bool(
-            loose
-        )
-        lines += [f"  {sentence}" for sentence in _of_scale(result)]
-        every = {n: p for n, p in every.items() if n not in own}
-    elif len(result.ladder) > 1:
-        lines.append(f"  {CHOSEN}")
-    if loose := [n for n, p in every.items() if p.stderr is None and p.free]:
-        lines.append(f"  the data do not determine: {', '.join(loose)}")
-    return [*lines, f"  {EVERYTHING}"]
-
-
 def _trembles(result: FitResult) -> bool:
-    """Whether a tremor is measured."""
-    found = result.target.measured.get("tremor_frequency")
-    return found is not None and math.isfinite(found.value)
+    """Whether a tremor is measured of a target."""
+    return any(
+        math.isfinite(part.target.measured["tremor_frequency"].value)
+        for part in result.parts.values()
+        if "tremor_frequency" in part.target.measured
+    )
 
 
-def _in_short(name: str, p: Estimate) -> str:
-    unit = "" if p.unit in ("1", "") else f" {p.unit}"
-    return f"{name} {p.in_words()}{unit}"
-
-
-def _whole_model(result: FitResult, everything: bool) -> list[str]:
-    """All that the data determine; with everything also what they do not, and what they leave
-    open."""
+def _whole_model(result: FitResult) -> list[str]:
+    """All that the data determine, what they do not, and what they leave open."""
     every, shown = result.as_shown(result.found), result.as_shown(result.determined)
     intervals = any(p.interval is not None for p in shown.values())
     bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
@@ -209,16 +357,14 @@ def _whole_model(result: FitResult, everything: bool) -> list[str]:
     lines = _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
     lines += [f"  {sentence}" for sentence in (*_counted(rows, every), *_by_band(result, bands))]
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
-    if loose and everything:
+    if loose:
         title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
         lines += [*_table(title, loose), *(f"  {sentence}" for sentence in _counted(loose, every))]
-    elif loose:
-        lines.append(f"  the data do not determine: {', '.join(loose)}")
     lines += [f"  {sentence}" for sentence in _of_scale(result)]
-    if result.undetermined and everything:
+    if result.undetermined:
         whose = "the data leave" if len(result.parts) == 1 else "all targets together leave"
         lines += [f"  {whose} open:", *(f"    - {sentence}" for sentence in result.undetermined)]
-    return lines if everything else [*lines, f"  {EVERYTHING}"]
+    return lines
 
 
 def _of_scale(result: FitResult) -> list[str]:
@@ -235,14 +381,11 @@ def _of_scale(result: FitResult) -> list[str]:
         )
     lines += _held(result)
     if result.per_newton:
-        mean = f"{result.derived[MEAN].value:.3g} N"
         torque = any(part.target.quantity == "torque" for part in result.parts.values())
         given = " (of a torque it needs the lever arm: --lever-arm)" * torque
         lines.append(
-            f"no mean force in newtons was given{given}, so the scale of force is unknown."
-            " Forces, masses, stiffness and damping are stated here per newton of mean force. In"
-            " fit.json (Python: result['K_w0'], to_dataframe()) they are those of a model muscle"
-            f" that pulls with {mean}: divide by {mean}"
+            f"no mean force in newtons was given{given}, so the scale of force is unknown. Forces,"
+            " masses, stiffness and damping are stated per newton of mean force"
         )
     return lines
 
@@ -315,7 +458,8 @@ def _held(result: FitResult) -> list[str]:
 
 def _per_newton(result: FitResult, shown: Mapping[str, Estimate]) -> str:
     """What the heading of a table says if numbers in it are no newtons."""
-    there = result.per_newton and any(result[name].unit in RELATIVE for name in shown)
+    own = result.parameters | result.derived
+    there = result.per_newton and any(own[name].unit in RELATIVE for name in shown)
     return " (per newton of mean force)" * bool(there)
 
 
@@ -436,12 +580,7 @@ def _closeness(part: FittedPart, before: str = "", *, verdict: str = "") -> str:
 
 def _choice(result: FitResult) -> tuple[str, ...]:
     """Why the models were tried."""
-    tremor = any(
-        math.isfinite(part.target.measured["tremor_frequency"].value)
-        for part in result.parts.values()
-        if "tremor_frequency" in part.target.measured
-    )
-    return explain_choice(result.ladder, _datum(result), tremor=tremor)
+    return explain_choice(result.ladder, _datum(result), tremor=_trembles(result))
 
 
 def _datum(result: FitResult) -> str:

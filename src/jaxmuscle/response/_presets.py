@@ -18,7 +18,7 @@ from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import AbstractTask
 
 FORMAT = 2  # of a preset
-FIT_FORMAT = 5  # of a fit.json
+FIT_FORMAT = 6  # of a fit.json
 
 
 def load_preset(name_or_path: str | Path) -> AbstractTask:

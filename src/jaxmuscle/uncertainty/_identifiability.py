@@ -97,7 +97,7 @@ def identifiability(
         )
         for design, (more, failed) in zip(tried, added, strict=True)
     ]
-    notices = tuple(n for n in result.notices if " ambiguous: " in n)
+    notices = tuple(n for n in result.unstated if " ambiguous: " in n)
     notices += (NO_NOISE,) * (designs is None and without_noise(fitted))
     # Of another target the fit has said nothing.
     found = result.found if target is None else {}
