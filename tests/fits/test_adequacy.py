@@ -287,7 +287,7 @@ def test_the_active_force_may_be_free_with_a_prior_in_ratio():
         **QUICK,
     )
     assert held and result.derived["model_mean"].value == pytest.approx(4.0, abs=0.1)
-    said = " ".join(str(result).split())
+    said = " ".join(result.details().split())
     assert (
         "held fixed: m_w = 0.5 kg, m_z = 0.5 kg, x_ref_w = 20 mm, x_ref_z = 20 mm. They are no"
         " measurements" in said

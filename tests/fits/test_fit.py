@@ -1121,7 +1121,7 @@ def test_two_equal_lines_make_the_frequency_ambiguous():
     )
     free = ("c_w", "noise_K_w", "harmonic_amplitude", "harmonic_frequency")
     found = jm.fit(jm.Isometric(), target, free=free, starts=6, seeds=16, check_seeds=16)
-    assert any("harmonic_frequency is ambiguous" in notice for notice in found.notices)
+    assert any("harmonic_frequency is ambiguous" in words for words in found.unstated)
     for table in (found.parameters, found.derived):
         assert (
             table["harmonic_frequency"].stderr is None

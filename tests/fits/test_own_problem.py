@@ -200,7 +200,7 @@ def test_scipy_finds_the_minimum_of_the_fit(problem, result):
     A fit ends when two steps in a row gain less than 1e-4 of the cost; the table of starts is that
     of the first descent.
     """
-    near = problem.theta({name: result[name].value for name in problem.names})
+    near = problem.theta({name: result.parameters[name].value for name in problem.names})
     for turn, used in enumerate((problem, problem.scattering_as(near))):
         residuals, slopes = (
             kept_jit(each) for each in (used.residuals, jax.jacfwd(used.residuals))

@@ -159,13 +159,13 @@ def test_tangents_do_not_hang_on_the_reference_displacement(minute, result, x64)
 
 
 def test_what_a_fit_says_and_keeps(result, tmp_path):
-    text = str(result)
-    assert "The model describes the data: chi2 per datum" in text and "PrescribedLength" in text
+    text = result.details()
+    assert "\n  chi2 per datum" in text and "PrescribedLength" in text
     held = "held fixed: x_ref_w = 20 mm. No record determines it, and K_w0 depends on it"
     assert "m_w = " not in text and held in " ".join(text.split())
     result.save(tmp_path / "fit.json")
     again = jm.load_result(tmp_path / "fit.json")
-    assert str(again) == text
+    assert again.details() == text
     np.testing.assert_array_equal(again.only.stiffness, result.only.stiffness)
     np.testing.assert_array_equal(again.target.stiffness.value, result.target.stiffness.value)
     assert len(result.ladder) == 1 and result.ladder[0].model == "slow part alone"

@@ -190,9 +190,12 @@ def test_posterior_as_files_and_figures(tmp_path):
     table = json.loads((tmp_path / "p.json").read_text())
     assert table["success"] and table["summary"]["c_w"]["r_hat"] == found.diagnostics["c_w"][0]
     draws, rows = found.to_dataframe(), found.summary().to_dataframe()
-    assert list(draws.columns) == ["chain", "draw", *found.quantities] and list(
-        rows["quantity"]
-    ) == list(found.quantities)
+    assert list(draws.columns) == ["chain", "draw", *found.quantities]
+    # no mean force in newtons was given: the summary is per newton of that of the model
+    assert list(rows["quantity"]) == [n for n in found.quantities if n != "model_mean"]
+    per_newton = np.median(found.quantities["K_w0"] / found.quantities["model_mean"])
+    shown = rows.set_index("quantity").loc["K_w0"]
+    assert (shown["median"], shown["unit"]) == (pytest.approx(per_newton, rel=1e-12), "1/m")
     last = draws[(draws["chain"] == 3) & (draws["draw"] == 7)]
     assert last["c_w"].item() == found.samples["c_w"][3, 7]
     assert rows.set_index("quantity")["r_hat"]["c_w"] == found.diagnostics["c_w"][0]

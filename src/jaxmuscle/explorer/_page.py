@@ -97,6 +97,7 @@ def content(task: AbstractTask | None, target: Target | None) -> dict[str, Any]:
     shown = {key: seen.get(key) for key in _SHOWN} | {
         "dispersion": target.dispersion,
         "notices": list(target.notices),
+        "newtons": target.mean_force is not None,
     }
     return {
         "state": {"table": bare_table(task.with_parts(settings=target.settings)), "target": shown}

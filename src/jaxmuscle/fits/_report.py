@@ -635,5 +635,6 @@ def _failed(problem: FitProblem, common: dict[str, Any], reason: str) -> FitResu
         harmonic_p_value=None,
         singular_values=np.full(free, np.nan),
         notices=tuple(notices),
+        unstated=(),
         **common,
     )

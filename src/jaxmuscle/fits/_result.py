@@ -920,6 +920,12 @@ class FitResult(Result, eqx.Module):
         is unknown."""
         return per_newton(table, self.derived[MEAN].value) if self.per_newton else dict(table)
 
+    def scale_as_shown(self, unit: str) -> tuple[float, str]:
+        """By what a number of this unit is multiplied to be shown, and its unit then."""
+        if self.per_newton and unit in RELATIVE:
+            return 1 / self.derived[MEAN].value, RELATIVE[unit]
+        return 1.0, unit
+
     def _card(self) -> Card:
         return load_above("reports").fit_card(self)
 

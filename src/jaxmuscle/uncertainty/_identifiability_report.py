@@ -60,7 +60,7 @@ WORDS = {
     "added": ". A, B, ...: with that measurement added",
     "per newton": (
         "no mean force in newtons was given: forces, stiffness and damping are stated per newton of"
-        " mean force (that of the fitted muscle is {force:.3g} N)"
+        " mean force"
     ),
     "masses": "taken as known, as in the fit: {masses}{opened}",
     "opened": "; but fitted in a record of a moved insertion",
@@ -327,7 +327,7 @@ def _table(report: IdentifiabilityReport) -> list[str]:
     added = WORDS["added"] * bool(possible)
     lines = _item(WORDS["errors"].format(doubted=doubted, far=FAR, added=added))
     if report.mean_force is not None:
-        lines += _item(WORDS["per newton"].format(force=report.mean_force))
+        lines += _item(WORDS["per newton"])
     elif report.masses:
         masses = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
         opened = WORDS["opened"] * any(design.masses_open for design in report.designs)
@@ -340,8 +340,10 @@ def _table(report: IdentifiabilityReport) -> list[str]:
         heads = ["prior", "now", *(label for label, _ in block)]
         rows = [["", "value", "unit", *heads]]
         for name in report.names:
+            if name == MEAN and report.mean_force is not None:
+                continue  # it is 1 N per newton
             now = report.present.quantities[name]
-            value, unit = _stated(now, None if name == MEAN else report.mean_force)
+            value, unit = _stated(now, report.mean_force)
             sure = now.determined and name not in report.open_in_fit
             cells = [_cell(now, now.prior_sd, False), _cell(now, now.stderr, sure)]
             later = [outlook.quantities[name] for _, outlook in block]

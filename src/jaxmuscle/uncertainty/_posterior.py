@@ -140,6 +140,7 @@ def _report(
         "chains": shape[0],
         "draws": shape[1],
         "warmup": warmup,
+        "per_newton": bool(result.per_newton),
         "step_size": found.step_size,
         "frequencies": max(1, sum(len(np.unique(band.frequency)) for band in density.bands)),
         "spectrum": {part.target.name: part.target.settings.to_dict() for part in problem.parts},

@@ -15,8 +15,9 @@ from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.data._target import Target
+from jaxmuscle.fits._result import RELATIVE
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._derived import unit_of
+from jaxmuscle.objective._derived import MEAN, unit_of
 
 from ._chains import Chains
 from ._posterior_checks import Replicates
@@ -122,17 +123,24 @@ class Posterior(Shown, eqx.Module):
         return self.samples | self.derived
 
     def summary(self) -> "Summary":
-        """Mean, sd, median and 95 % interval of every quantity. Raises `NotMixedError` if the
-        chains did not mix."""
+        """Mean, sd, median and 95 % interval of every quantity; where the fit had no mean force in
+        newtons, forces, masses, stiffness and damping per newton of mean force. Raises
+        `NotMixedError` if the chains did not mix."""
         if not self.success:
             raise NotMixedError(f"{self.title}: {self.message}")
         rows = {}
+        relative = bool(self.settings.get("per_newton"))
         for name, draws in self.quantities.items():
+            unit = self.unit(name)
+            if relative and name == MEAN:
+                continue
+            if relative and unit in RELATIVE:
+                draws, unit = draws / self.derived[MEAN], RELATIVE[unit]
             low, middle, high = np.quantile(draws, (0.025, 0.5, 0.975)).tolist()
             spread = {"mean": float(draws.mean()), "sd": float(draws.std(ddof=1))}
             rows[name] = {**spread, "median": middle, "low": low, "high": high}
             rows[name] |= dict(zip(MIXING, self.diagnostics[name], strict=True))
-            rows[name] |= {"unit": self.unit(name), "determined": name in self.determined}
+            rows[name] |= {"unit": unit, "determined": name in self.determined}
         return Summary(rows, self._text())
 
     def unit(self, name: str) -> str:

@@ -171,12 +171,15 @@ def profile(
     values, places = np.unique(table[0], return_index=True)
     _, height, cost = table[:, places]
     rise = 2 * (cost - cost.min()) if with_priors else 2 * (height.max() - height)
+    unit = unit_of(name, problem.parts[problem.where(name)[0]].task.output_unit) or "1"
+    scale, unit = result.scale_as_shown(unit)
+    values = scale * values
     return Profile(
         name,
-        unit_of(name, problem.parts[problem.where(name)[0]].task.output_unit) or "1",
+        unit,
         problem.title,
-        float(own[0]),
-        float(scan.stderr),
+        scale * float(own[0]),
+        scale * float(scan.stderr),
         values,
         rise,
         _intervals(values, rise, float(scipy.stats.chi2.ppf(level, 1))),

@@ -45,19 +45,28 @@ export function showSpectrum(state, seen) {
   });
   const base = baseOf(table),
     top = seen.power.indexOf(Math.max(...seen.power)),
-    sd = Math.sqrt(seen.variance);
+    sd = Math.sqrt(seen.variance),
+    // of a target without a mean in newtons nobody knows the scale of force
+    relative = target && unit === "N" && !target.newtons,
+    own = (value) => digits(relative ? value / seen.mean : value, 3);
+  const [stiffness, damping] = relative ? ["1/m", "s/m"] : ["N/m", "N s/m"],
+    whose = relative ? ", per newton of mean force" : "";
   const numbers = [
     ["chi² per bin", match ? (match.chi2 === null ? "unknown: give segments" : digits(match.chi2, 3)) : "no data"],
     ["bins", target ? `${target.bins.length} of ${seen.power.length}` : `${seen.power.length}`],
-    [`mean ${name}`, `${digits(seen.mean)} ${unit}`],
-    ["standard deviation", `${digits(sd, 3)} ${unit}`],
+    ...(relative
+      ? []
+      : [
+          [`mean ${name}`, `${digits(seen.mean)} ${unit}`],
+          ["standard deviation", `${digits(sd, 3)} ${unit}`],
+        ]),
     [
       "coefficient of variation",
       Math.abs(seen.mean) > 1e-9 * sd ? `${digits((100 * sd) / Math.abs(seen.mean), 3)} %` : "mean is 0",
     ],
     ["maximum at", `${digits(frequencies(settings)[top], 3)} Hz`],
-    ["stiffness at rest K_w0, K_z0", `${digits(base[0], 3)}, ${digits(base[1], 3)} N/m`],
-    ["damping at rest C_w0, C_z0", `${digits(base[2], 3)}, ${digits(base[3], 3)} N s/m`],
+    [`stiffness at rest K_w0, K_z0${whose}`, `${own(base[0])}, ${own(base[1])} ${stiffness}`],
+    [`damping at rest C_w0, C_z0${whose}`, `${own(base[2])}, ${own(base[3])} ${damping}`],
   ];
   $("numbers").replaceChildren(
     ...numbers.map(([key, value]) => {
