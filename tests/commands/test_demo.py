@@ -2,14 +2,15 @@
 true of the simulated people."""
 
 import hashlib
+import itertools
 import shlex
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pages
 import pytest
 import typer
 from in_process import refused, run
-from pages import ROOT, module
 
 import jaxmuscle as jm
 from jaxmuscle.commands import simulated
@@ -94,15 +95,48 @@ def test_the_moved_limb_has_its_spring_damper_and_mass(folder, tmp_path):
         assert abs(found.value - true) < 4 * found.stderr < 0.2 * true
     # so does the command find both columns, unless the force alone is asked for
     given = run("analyse", folder / "moved.csv", "--out", tmp_path / "both")
-    assert "treated as a recording of a limb that a motor moves" in given.stderr
+    assert "treated as one of a motor-driven limb" in given.stderr
     assert (tmp_path / "both" / "response.csv").exists()
     run("analyse", folder / "moved.csv", "--column", "force_N", "--out", tmp_path / "force")
     assert not (tmp_path / "force" / "response.csv").exists()
 
 
+def quoted(page, first):
+    """The lines of the block of a page that begins with these words."""
+    lines = (pages.ROOT / page).read_text(encoding="utf-8").splitlines()
+    block = lines[lines.index(f"    {first}") :]
+    return [line[4:] for line in itertools.takewhile(lambda line: line.startswith("    "), block)]
+
+
+def test_pages_quote_what_is_printed(folder, study, monkeypatch):
+    """Each line of an output in README and tutorials; their Python is run."""
+    monkeypatch.chdir(folder.parent)
+    steadiness = pages.run("docs/tutorial-steadiness.md")["found"]
+    measured = "Steadiness of 3 trials: force [N], 14.3 s"
+    table = "Table 1: mean ± SD of people; in brackets of how many, where some have no value"
+    for page, first, result in (
+        ("README.md", measured, steadiness),
+        ("docs/tutorial-steadiness.md", measured, steadiness),
+        ("docs/tutorial-steadiness.md", table, study),
+    ):
+        assert set(quoted(page, first)) <= set(str(result).splitlines()), (page, first)
+    pages.run("docs/tutorial-study.md")
+    assert (folder / "mine.csv").read_text() == (folder / "study.csv").read_text()
+    (folder / "mine.csv").unlink()
+    first = "Comparisons of what is measured: 8 of conditions; after correction (holm) 3 have"
+    of_both = quoted("docs/tutorial-study.md", first)
+    of_model = next(i for i, line in enumerate(of_both) if line.startswith("Model of all"))
+    assert set(of_both[:of_model]) <= set(str(study).splitlines())
+    analysed = run("analyse", "demo/moved.csv", "--out", "moved").stdout.splitlines()
+    wanted = quoted(
+        "docs/perturbed.md", "  gain       483.7 to 1310 N/m, standard error 2.2 % (median)"
+    )
+    assert set(wanted) <= {line.rstrip() for line in analysed}
+
+
 def test_the_first_picture_is_drawn_of_them(folder):
     """Names of axes with their units, and what is stated in it is what was measured."""
-    figure = module(ROOT / "docs" / "results.py").draw(folder)
+    figure = pages.module(pages.ROOT / "docs" / "results.py").draw(folder)
     figure.draw_without_rendering()
     _, spectra, stiffness = figure.axes
     assert spectra.get_ylabel() == "Power (1e-6 mean²/Hz)" and "(N/m)" in stiffness.get_ylabel()

@@ -87,12 +87,15 @@ def moved_by_motor(paths: Sequence[str], reading: dict[str, Any]) -> bool:
             found = channels(table, reading)
         except ValueError:  # several may be meant: then the force alone is looked for
             continue
-        if found and not (moves := jm.data.movement(table, found["displacement"])).rests:
-            say_notice(
-                f"{found['displacement']} moves by {moves}, so this is treated as a recording of a"
-                f" limb that a motor moves. The force alone: --column '{found['force']}'"
-            )
-            return True
+        if not found or (moves := jm.data.movement(table, found["displacement"])).rests:
+            continue
+        if moves.unit == "deg" and reading["lever_arm"] is None:  # torque and angle have a notice
+            continue
+        say_notice(
+            f"{found['displacement']} moves by {moves}, so the recording is treated as one of a"
+            f" motor-driven limb. The force alone: --column '{found['force']}'"
+        )
+        return True
     return False
 
 
