@@ -19,6 +19,7 @@ TABLE, MOVED, README = "study.csv", "moved.csv", "README.txt"
 RATE = 250.0  # Hz
 REST, RAMP, HOLD, LEAD = 1.5, 1.5, 16.0, 4.0  # s; LEAD: until the noise of the muscle is stationary
 MOTION = 66.0  # s of the hold in which a motor moves
+EDGE = 7.0  # Hz, above which the motor is slower
 TRIALS = 3
 SENSOR = 0.02  # N, standard deviation of the sensor's own noise
 STIFFNESS, DAMPING, MASS = 1200.0, 15.0, 0.4  # N/m, N s/m, kg of the limb that is moved
@@ -144,10 +145,10 @@ def _moved(
     held: Float[np.ndarray, " times"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, " times"]]:
     """Force [N] and lengthening [m] of a limb that is a spring, a damper and a mass, moved by 1 mm
-    rms of sines from 0.3 to 8 Hz."""
+    rms from 0.3 Hz on, less above the `EDGE`."""
     f = np.fft.rfftfreq(held.size, 1 / RATE)
-    band = (f >= 0.3) & (f <= 8.0)
-    lines = np.where(band, np.exp(2j * np.pi * rng.uniform(size=f.size)), 0.0)
+    size = np.where((f >= 0.3) & (f <= 20.0), 1 / np.sqrt(1 + (f / EDGE) ** 8), 0.0)
+    lines = size * np.exp(2j * np.pi * rng.uniform(size=f.size))
     lines *= 1e-3 / np.fft.irfft(lines, held.size).std()
     s = 2j * np.pi * f
     answer = (STIFFNESS + DAMPING * s + MASS * s**2) * lines
@@ -179,7 +180,7 @@ def _readme(commands: str) -> str:
 
 {TABLE}             the table of the study: file, person, condition, trial
 sim01_rest_1.csv ...  {people} people hold a force for {HOLD:g} s, {TRIALS} times at rest and tired
-{MOVED}             a motor moves the limb of sim01 during a hold (1 mm rms, 0.3 to 8 Hz)
+{MOVED}             a motor moves the limb of sim01 during a hold (1 mm rms, 0.3 to {EDGE:g} Hz)
 
 Time in s, force in N, displacement (lengthening) in mm, {RATE:g} samples per second.
 
