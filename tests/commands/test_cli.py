@@ -841,6 +841,7 @@ OVERWRITES = {
     ),
     "compare": ("comparison.compare_noise", ["compare", "{csv}"], ["compare.json"]),
     "reproduce": ("paper.reproduce", ["reproduce"], ["claims.json"]),
+    "demo": ("ensemble", ["demo"], ["study.csv", "moved.csv", "README.txt", "sim06_tired_3.csv"]),
 }
 
 

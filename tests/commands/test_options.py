@@ -32,6 +32,7 @@ VALID = {
     "speed": [],
     "identifiability": ["t.csv", "--segments", "12"],
     "study": ["s.csv"],
+    "demo": [],
     "explore": ["t.csv", "--no-open", "--out", "e.html"],
 }
 NUMBERS = ("nan", "inf", "-inf", "1e400", "-1", "9" * 40, "", "text", "1,5", "1e300", "0")

@@ -256,3 +256,23 @@ def test_a_joint_that_is_held_needs_no_lever_arm(tmp_path):
             ValueError, match="give the distance from the axis to the insertion in m"
         ):
             read_recordings(paths, reading, None, task)
+
+
+@pytest.mark.parametrize(
+    ("swing", "arm", "moved"),
+    [(5.0, [], False), (5.0, ["--lever-arm", 0.3], True), (0.0, [], False)],
+)
+def test_torque_beside_an_angle_that_moves(swing, arm, moved, tmp_path):
+    """As of a limb that a motor moves where the lever arm is known, else the torque alone."""
+    x = force(7)
+    time = np.arange(x.size) / RATE
+    path = tmp_path / "joint.csv"
+    np.savetxt(
+        path,
+        np.column_stack([time, x, swing * np.sin(np.pi * time)]),
+        delimiter=",",
+        header="time_s,torque_Nm,angle_deg",
+        comments="",
+    )
+    assert run("analyse", path, "--out", tmp_path, *arm).exit_code == 0
+    assert (tmp_path / "response.csv").exists() == moved

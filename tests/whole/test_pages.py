@@ -29,6 +29,8 @@ ELSEWHERE = {
     "docs/perturbed.md": "data/test_perturbed.py",
     "docs/perturbed-design.md": "uncertainty/test_input_design.py",
     "docs/study.md": "fits/test_study.py",
+    "docs/tutorial-steadiness.md": "commands/test_demo.py",
+    "docs/tutorial-study.md": "commands/test_demo.py",
 }
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
@@ -43,7 +45,6 @@ RUN_HERE = {
     "docs/how-to/own-optimiser.md",
     "docs/how-to/report-results.md",
     "docs/identifiability.md",
-    "docs/index.md",
     "docs/machine-learning.md",
     "docs/python.md",
     "docs/recordings.md",
@@ -55,7 +56,7 @@ RUN_HERE = {
 # Data with a rhythm are also tried with a tremor: two more programs of each fit, which
 # fits/test_rungs.py has.
 FEW = "rungs=0, starts=16, seeds=16, check_seeds=16"
-OF_TRIALS = {'"trial3.csv"])\n# without': f'"trial3.csv"], {FEW})\n# without'}
+OF_TRIALS = {"trials.target())": f"trials.target(), {FEW})"}
 
 
 def jitted(*functions: str) -> dict[str, str]:
@@ -259,7 +260,7 @@ def in_python(once, readme):
 
 def test_readme(readme):
     """Every block of Python, on recordings of one person."""
-    _, names = readme
+    folder, names = readme
     mine = names["mine"]
     assert (
         names["slope"] != 0
@@ -268,7 +269,8 @@ def test_readme(readme):
     )
     variation = mine.derived["model_coefficient_of_variation"]
     # A fourth trial of the same person, known to √3 times the error of the mean of three.
-    (fourth,) = names["recording"].steady().target().coefficient_of_variation
+    recording = jm.load_recording(folder / "trial.csv").steady()
+    (fourth,) = recording.target().coefficient_of_variation
     assert variation.stderr is not None and abs(variation.value - fourth) < 4 * 2 * variation.stderr
 
 
@@ -303,7 +305,7 @@ def test_uncertainty(in_python):
 
 
 @pytest.mark.slow
-def test_tutorial_and_front_page():
+def test_tutorial_and_report():
     # The target is the bundled one, written and read again.
     few = {
         "target.task(), target)": f"target.task(), target, {FEW})",
@@ -311,7 +313,6 @@ def test_tutorial_and_front_page():
     }
     names = pages.run("docs/tutorial.md", {}, few)
     assert "harmonic_frequency" in names["sharper"].free and jm.load_result("mine.json").success
-    assert pages.run("docs/index.md", {}, {"seeds=1000)": "seeds=100)"})["result"].success
     reported = pages.run("docs/how-to/report-results.md")["reported"]
     assert {"corner_frequency", "coefficient_of_variation"} <= set(reported["quantity"]) and Path(
         "table.csv"

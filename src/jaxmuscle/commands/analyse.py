@@ -33,6 +33,7 @@ from .options import (
     formats_of,
 )
 from .recordings import (
+    moved_by_motor,
     perturbed,
     read_perturbed,
     read_trials,
@@ -78,15 +79,16 @@ def analyse(
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """Look at a recording, or at the trials of one person in one condition: level, variability,
-    regularity, spectrum.
+    """Look at recordings: level, variability, spectrum. Of a moved limb: stiffness, damping, mass.
 
-    The steady part of each recording is found automatically, unless --window gives it. The spectra
-    of several trials are averaged. Writes DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
+    Give one recording, or the trials of one person in one condition. The steady part of each is
+    found automatically, unless --window gives it. The spectra of several trials are averaged.
+    Writes DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
 
-    If a motor moved the insertion, name both columns with --force-column and --displacement. Then
-    you get the dynamic stiffness instead, in DIR/analysis.json, DIR/response.csv and
-    DIR/analysis.png.
+    Of a limb that a motor moved you get the dynamic stiffness instead, with stiffness K, damping B
+    and mass I, in DIR/analysis.json, DIR/response.csv and DIR/analysis.png. The columns of force
+    and displacement are found, or named with --force-column and --displacement. --column NAME
+    analyses the force alone.
 
     Examples:
 
@@ -98,7 +100,7 @@ def analyse(
 
         jaxmuscle analyse trial.c3d --column finger --axis principal --reference stand --window all
 
-        jaxmuscle analyse perturbed.csv --force-column force_N --displacement displacement_mm
+        jaxmuscle analyse moved.csv --force-column force_N --displacement displacement_mm
     """
     with reporting(as_json):
         if mvc is not None:
@@ -113,7 +115,9 @@ def analyse(
         if save_target is not None:
             spare(paths, [save_target])
             absent(save_target, force=force)
-        moved = perturbed(reading)
+        moved = perturbed(reading) or (
+            save_target is None and mvc is None and moved_by_motor(paths, reading)
+        )
         writable(
             output,
             "analysis.json",

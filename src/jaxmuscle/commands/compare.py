@@ -67,8 +67,7 @@ def compare(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Which noise? Fit one spectrum with each colour of noise and with richer models, and say which
-    can be told apart.
+    """Fit one spectrum with each colour of noise and with richer models, and compare them.
 
     Each colour is fitted with and without a harmonic (a regular rhythm). The richer models have
     activation or resonance. Writes DIR/compare.csv, DIR/compare.json and DIR/compare.png, and

@@ -42,7 +42,7 @@ def explore(
     ] = True,
     as_json: Json = False,
 ) -> None:
-    """Move parameters with sliders, in a browser, and see what becomes of the spectrum.
+    """Explore the model with sliders in the browser.
 
     Writes one HTML file that holds everything and needs no network. You can send it to others.
 

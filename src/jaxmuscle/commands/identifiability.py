@@ -38,8 +38,7 @@ def identifiability(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """What should you measure next? Say what the data determine, and what further measurements
-    would.
+    """Say what your data determine, and what further measurements would determine.
 
     Fits first (unless given a fit.json). The further measurements are the usual ones: the mean
     force, the displacement under a load, a moved insertion, another force level, a longer

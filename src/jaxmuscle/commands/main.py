@@ -15,6 +15,7 @@ from jaxmuscle._common.bundled import describe_presets, describe_targets
 from .analyse import analyse
 from .compare import compare
 from .console import out, plain, record, reporting
+from .demo import demo
 from .design import design
 from .ensemble import ensemble
 from .explore import explore
@@ -28,23 +29,18 @@ from .speed import speed
 from .steadiness import steadiness
 from .study import study
 
+MEASURE, MODEL, SIMULATE = "Measure a force", "Fit the model", "Simulate, and more"
+
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
 
-app.command()(fit)
-app.command()(simulate)
-app.command()(ensemble)
-app.command()(analyse)
+for measure in (demo, analyse, steadiness, study):
+    app.command(rich_help_panel=MEASURE)(measure)
 app.command("analyze", hidden=True)(analyse)
-app.command()(steadiness)
-app.command()(posterior)
-app.command()(identifiability)
-app.command()(design)
-app.command()(compare)
-app.command()(reproduce)
-app.command()(speed)
-app.command()(study)
-app.command()(explore)
+for model in (fit, identifiability, design, posterior, compare, explore):
+    app.command(rich_help_panel=MODEL)(model)
+for other in (simulate, ensemble, reproduce, speed):
+    app.command(rich_help_panel=SIMULATE)(other)
 
 
 def show_version(wanted: bool) -> bool:
@@ -72,16 +68,15 @@ def common(
         ),
     ] = False,
 ) -> None:
-    """Fit a muscle model to measured force, analyse recordings, and simulate the fluctuations of
-    force.
+    """How steady is a force, where does it tremble, and how stiff is the muscle?
 
     `jaxmuscle COMMAND --help` explains a command and its options.
 
     Examples:
 
-        jaxmuscle fit vastus-lateralis-26mvc --out out/fit
+        jaxmuscle demo
 
-        jaxmuscle analyse trial.csv --column force --rate 2048
+        jaxmuscle steadiness trial1.csv trial2.csv trial3.csv --units N
     """
     logging.basicConfig(format="%(message)s", stream=sys.stderr)
     logging.getLogger("jaxmuscle").setLevel(
@@ -89,7 +84,7 @@ def common(
     )
 
 
-@app.command()
+@app.command(rich_help_panel=MODEL)
 def targets(as_json: Json = False) -> None:
     """List the bundled targets: the spectra that `jaxmuscle fit` knows by name.
 
@@ -109,7 +104,7 @@ def targets(as_json: Json = False) -> None:
         out.print(table)
 
 
-@app.command()
+@app.command(rich_help_panel=SIMULATE)
 def presets(as_json: Json = False) -> None:
     """List the bundled presets: muscles in a task that `jaxmuscle simulate` knows by name.
 

@@ -78,9 +78,9 @@ def posterior(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """How sure is a fit? Draw from the posterior of the muscle's parameters.
+    """Draw the posterior of a fit: the probability of all its parameters together, given your data.
 
-    The posterior is the probability of all parameters together, given your data. Fits first (unless
+    Fits first (unless
     given a fit.json), then draws from the posterior with several random chains (Hamiltonian Monte
     Carlo). Writes DIR/fit.json, DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png,
     predictive.png, chains.png and report.html. The exit code is 1 if the fit failed or the chains

@@ -77,6 +77,28 @@ def perturbed(reading: dict[str, Any]) -> bool:
     return reading["force_column"] is not None or reading["displacement"] is not None
 
 
+def moved_by_motor(paths: Sequence[str], reading: dict[str, Any]) -> bool:
+    """Whether no column is named, and a file holds force and a displacement that moves; said if
+    so."""
+    if reading["column"] is not None:
+        return False
+    for table in tables_of(paths, reading):
+        try:
+            found = channels(table, reading)
+        except ValueError:  # several may be meant: then the force alone is looked for
+            continue
+        if not found or (moves := jm.data.movement(table, found["displacement"])).rests:
+            continue
+        if moves.unit == "deg" and reading["lever_arm"] is None:  # torque and angle have a notice
+            continue
+        say_notice(
+            f"{found['displacement']} moves by {moves}, so the recording is treated as one of a"
+            f" motor-driven limb. The force alone: --column '{found['force']}'"
+        )
+        return True
+    return False
+
+
 def read_recordings(
     paths: Sequence[str], reading: dict[str, Any], window: str | None, task: str | None
 ) -> "list[PerturbedRecording] | Trials":

@@ -28,8 +28,7 @@ def speed(
     threads: Threads = None,
     as_json: Json = False,
 ) -> None:
-    """How fast is this machine? Measure compile time, steps per second, real-time factor and
-    memory.
+    """Measure the speed of this machine: compile time, steps per second, real-time factor, memory.
 
     It simulates as `jaxmuscle ensemble --reduce` does, but without the linear model beside it
     (control variate). The real-time factor is simulated time over elapsed time. The numbers are

@@ -35,16 +35,15 @@ def steadiness(
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """How steady is a force? Variability, power by band, tremor, regularity of one or several
-    trials, without a model; or of all people of a study.
+    """Measure how steady a force is, without a model: variability, power by band, tremor.
 
     Give the trials of one person in one condition. Prints every value with its standard error and
     95 % interval. From three trials on, they follow from how much the trials differ. Writes
     DIR/steadiness.json, DIR/steadiness.csv (a row per trial and quantity) and DIR/steadiness.png.
 
-    Or give the table of a study (`jaxmuscle study` says what it holds). Prints Table 1 of a paper,
-    mean and SD by group and condition, and what differs. Writes what `jaxmuscle study` writes, but
-    for the fits.
+    Or give the table of a study (`jaxmuscle study --help` says what it holds). Prints Table 1 of a
+    paper, mean and SD by group and condition, and what differs. Writes what `jaxmuscle study`
+    writes, but for the fits.
 
     Examples:
 

@@ -90,8 +90,7 @@ def study(
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """Compare groups and conditions: measure all recordings of a study, fit them with one model,
-    write tables, figures and methods.
+    """Compare groups and conditions: Table 1, tests, figures, one model for all people, methods.
 
     Prints Table 1 (mean and SD of what is measured, by group and condition), then what differs,
     then the model. `jaxmuscle steadiness` with the same table does the first part alone.
