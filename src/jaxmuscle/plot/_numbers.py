@@ -29,7 +29,7 @@ BAND = re.compile(
     r"(?P<kind>band|share|relative_power|power)_(?P<low>[\d.]+|above)_(?P<high>[\d.]+)"
 )
 KINDS = {
-    "band": "power",
+    "band": "share of power",
     "share": "share of variance",
     "relative_power": "power",
     "power": "power",
