@@ -145,16 +145,22 @@ minute = jm.data.PerturbedRecording.from_array(
 """
 STUDY = """
 rows = []
+shaking = jm.model.on_rung(jm.Isometric(), 2).at_level(0.3, reference=0.26)
 for i, name in enumerate(people):
-    one = jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)).at_level(0.3, reference=0.26)
-    for j, force in enumerate(
-        np.asarray(jm.ensemble(one.settled(), jax.random.key(i), seeds=3, duration=25.0).output)
-    ):
-        np.save(f"{name}-{j}.npy", force)
-        rows.append(
-            {"file": f"{name}-{j}.npy", "person": name, "group": "ab"[i % 2], "trial": str(j)}
+    for j, (condition, size) in enumerate({"rest": 0.08, "tired": 0.12}.items()):
+        one = shaking.replace(
+            noise_K_w=0.12 + 0.01 * i,
+            noise_K_z=0.002,
+            resonance_frequency=9.0 - 0.8 * (i % 2) - 0.3 * j + 0.2 * i,
+            resonance_amplitude=size,
         )
-study = jm.run_study(rows, rate=100.0, units="N m", window=(5.0, 25.0), rung=0)
+        run = jm.ensemble(one.settled(), jax.random.key(i + 10 * j), seeds=3, duration=25.0)
+        for k, force in enumerate(np.asarray(run.output)):
+            file = f"{name}-{condition}-{k}.npy"
+            np.save(file, force)
+            about = {"person": name, "group": "ab"[i % 2], "condition": condition}
+            rows.append(about | {"file": file, "trial": str(k)})
+study = jm.run_study(rows, rate=100.0, units="N m", window=(5.0, 25.0), rung=2)
 """
 SECTIONS = (
     Section(
@@ -164,14 +170,8 @@ SECTIONS = (
             Shown(
                 "fit.png",
                 "result.plot()",
-                "A fit: spectra, residuals, output",
+                "A fit: spectrum with its parts, residuals",
                 "tutorial.md#4-read-it",
-            ),
-            Shown(
-                "gallery/components.png",
-                "jm.plot.components(result)",
-                "What the power is made of",
-                "fitting.md",
             ),
             Shown(
                 "gallery/starts.png",
@@ -387,7 +387,13 @@ SECTIONS = (
             Shown(
                 "gallery/study.png",
                 "study.plot()",
-                "A study: spectra of people and of groups",
+                "A study: spectra of people and of groups, peaks marked",
+                "study.md",
+            ),
+            Shown(
+                "gallery/quantities.png",
+                'study.figures()["quantities"]',
+                "Its quantities: people, joined, and the means with their intervals",
                 "study.md",
             ),
         ),

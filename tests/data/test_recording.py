@@ -374,9 +374,9 @@ def test_refused(case):
 def test_figure():
     x, _ = ramp_and_hold()
     figure = Recording(x, 500, name="trial", source="$a_b$").steady().plot()
-    assert isinstance(figure, Figure) and len(figure.axes) == 4 and figure.get_suptitle() == "trial"
+    assert isinstance(figure, Figure) and len(figure.axes) == 3 and figure.get_suptitle() == "trial"
     figure.canvas.draw()
-    welch = figure.axes[3].lines[-1]
+    welch = figure.axes[2].lines[-1]
     assert welch.get_label().startswith("Welch, ") and len(welch.get_xdata()) == 30
     plt.close(figure)
     figure = Recording(noisy(rate=60), 60, unit="V").plot()

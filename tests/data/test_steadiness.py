@@ -509,7 +509,11 @@ def test_tables_and_files(found, tmp_path):
     )
     assert isinstance(table, pandas.DataFrame)
     figure = found.plot()
-    assert len(figure.axes) == 3
+    frequency, power, mean = found.spectrum
+    together = jm.data.Trials(trials()).spectrum()
+    np.testing.assert_allclose(mean[: together.power.size], together.power, rtol=1e-9)
+    assert power.shape == (3, frequency.size) and 19.5 < frequency[-1] <= 20
+    np.testing.assert_allclose(np.average(power, axis=0), mean)
     plt.close(figure)
 
 

@@ -461,6 +461,9 @@ def test_a_fit_of_recordings_keeps_what_was_measured(strong, tmp_path):
     for kept in (result, jm.load_result(tmp_path / "fit.json")):
         np.testing.assert_equal({name: m.row() for name, m in kept.measured.items()}, wanted)
         assert kept["mean"] == kept.measured["mean"] != kept["model_mean"]
+        time, force = kept.recorded
+        np.testing.assert_array_equal(force, found[0].filtered()[:500])
+        np.testing.assert_allclose(time, np.arange(500) / 100)
 
 
 def test_profile_and_reopening_keep_the_mean(strong):

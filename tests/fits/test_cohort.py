@@ -137,8 +137,7 @@ def test_a_member_says_what_was_not_done():
     assert any(notice.startswith("fitted by the formula alone") for notice in member.notices)
     figure = member.plot()
     try:
-        said = {text.get_text() for ax in figure.axes for text in ax.texts}
-        assert "not simulated" in said and "no finite simulation" not in said
+        assert len(figure.axes) == 2 and not any(ax.texts for ax in figure.axes)
     finally:
         plt.close(figure)
 

@@ -472,9 +472,7 @@ def test_the_figure(quick):
     figure = quick.plot()
     try:
         titles = [ax.get_title(loc="left") for ax in figure.axes]
-        assert sum(title.startswith("χ² per bin") for title in titles) == 2
-        assert "low: Isometric" in titles and "high: Isometric" in titles
-        assert figure.get_suptitle().splitlines()[0] == "low, high"
+        assert titles == ["low", "", "high", ""]
     finally:
         plt.close(figure)
 

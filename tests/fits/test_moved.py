@@ -144,7 +144,6 @@ def test_its_figure_shows_gain_phase_and_residuals(fitted):
     np.testing.assert_allclose(
         lines["imaginary (damping)"], np.imag(result.only.stiffness_residual)
     )
-    assert figure.get_suptitle().splitlines()[0] == result.target.name
     plt.close(figure)
 
 
@@ -238,7 +237,7 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
         assert abs(result[name].value - true) < 4.5 * result[name].stderr
     figure = result.plot()
     shown = [ax.get_ylabel() for ax in figure.axes]
-    assert {"Gain (N/m)", "Phase (deg)", "Residual (SE)", "Residual (SD)"} <= set(shown)
+    assert {"Gain (N/m)", "Phase (deg)", "Residual (SE)", "Residual\n(SD)"} <= set(shown)
     plt.close(figure)
     hold = tmp_path / "hold.csv"
     force = np.asarray(
@@ -276,7 +275,7 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
     assert {file.name for file in folder.iterdir()} == {"fit.json", "spectrum.csv", "stiffness.csv"}
     figure = joint.plot()
     titles = [ax.get_title(loc="left") for ax in figure.axes]
-    assert {"moved: PrescribedLength", "held: Isometric", "moved: dynamic stiffness"} <= set(titles)
+    assert {"moved", "held", "moved: dynamic stiffness"} <= set(titles)
     plt.close(figure)
 
 

@@ -80,6 +80,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
             Start(None, False, 3, (), "spread"),
         ),
         "stretch": (np.arange(10.0, 15.0, 0.01), rng.standard_normal(500)),
+        "recorded": (np.arange(400) / 100, rng.standard_normal(400)),
         "profile": (np.linspace(0.4, 11.7, 64), rng.uniform(0, 9, 64)),
         "harmonic_p_value": 0.08,
         "check": {

@@ -10,15 +10,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.special
-from matplotlib.colors import to_rgb, to_rgba
+from matplotlib.colors import to_rgb
 
 from jaxmuscle import plot
 from jaxmuscle._common.figures import pixels_of, write_figure
 from jaxmuscle.checks._bootstrap import Bootstrap, Recovery
+from jaxmuscle.data._measure import Measure
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._tasks import Isometric, PrescribedForce, PrescribedLength, PrescribedMotion
-from jaxmuscle.plot import _fit as _plot_fit
 from jaxmuscle.plot import _numbers as _plot_numbers
 from jaxmuscle.plot import _steadiness as _plot_steadiness
 from jaxmuscle.response._characteristics import static_characteristics
@@ -159,10 +159,11 @@ def test_drawing_into_given_axes_takes_the_next_colour_that_colour_blind_readers
 def test_what_is_drawn_later_is_not_cut_off():
     flat = Target("flat", np.ones(30))
     both = plot.spectrum(spectra(()), plot.target(flat))
-    linear = panels(plot.fit(result(target=flat)))[0]
-    for ax, line in ((both, both.lines[1]), (linear, named(linear, "fit"))):
-        assert ax.get_ylim()[0] == 0 and ax.get_ylim()[1] > np.max(line.get_ydata())
-        assert ax.get_xlim()[0] == 0 and ax.get_xlim()[1] > F[-1]
+    assert both.get_ylim()[0] == 0 and both.get_ylim()[1] > np.max(both.lines[1].get_ydata())
+    assert both.get_xlim()[0] == 0 and both.get_xlim()[1] > F[-1]
+    spectrum, _ = panels(plot.fit(result(target=flat)))
+    assert spectrum.get_ylim()[1] > np.max(named(spectrum, "fit").get_ydata())
+    assert spectrum.get_xlim()[0] < F[0] and spectrum.get_xlim()[1] > F[-1]
 
 
 def test_target_with_segments_has_the_band_of_its_degrees_of_freedom():
@@ -278,17 +279,12 @@ def estimate(value, unit, stderr=None, free=True, identifiable=None):
 def result(**changes):
     """What a fit returns, as far as its figures read it."""
     aim = changes.pop("target", load_target("vastus-lateralis-26mvc"))
-    f, allowed = aim.frequency, np.linspace(0.4, 11.7, 64)
+    f = aim.frequency
     share = np.where(np.abs(f - 3.9) < 0.5, 0.5, 0.0)
     fitted = 1 / (1 + f**2) / (1 - share)
     fields = {
-        "success": True,
-        "adequate": True,
-        "adequacy_p": 0.2,
         "task": Isometric().replace(harmonic_frequency=3.9),
         "target": aim,
-        "chi2_per_bin": 1.21,  # of the simulated mean: the verdict has its own
-        "closeness": "chi2 per bin 1.18",
         "frequency_hz": f,
         "fitted": fitted / fitted.sum(),
         "harmonic_share": share,
@@ -299,10 +295,8 @@ def result(**changes):
         },
         "residual": np.resize([0.5, -1.5, 2.5, -0.5], f.size),
         "deviation": np.full(f.size, 0.3),
-        "per_newton": {},
         "stretch": (10 + np.arange(500) / 100, 5 + 0.01 * np.sin(np.arange(500))),
-        "profile": (allowed, 10 - 9 * np.exp(-((allowed - 3.9) ** 2))),
-        "harmonic_p_value": 0.08,
+        "recorded": (np.arange(400) / 100, 20 + np.cos(np.arange(400))),
         "stiffness": None,
     }
     found = Fake(**(fields | changes))
@@ -314,8 +308,7 @@ def result(**changes):
 def failed():
     names = ("fitted", "harmonic_share", "residual")
     nothing = dict.fromkeys(names, np.full(30, np.nan))
-    unknown = ("chi2_per_bin", "adequate", "adequacy_p", "deviation", "profile", "harmonic_p_value")
-    return result(success=False, stretch=((), ()), **nothing, **dict.fromkeys(unknown))
+    return result(stretch=(np.zeros(0), np.zeros(0)), deviation=None, **nothing)
 
 
 def tremor(size=0.8):
@@ -326,8 +319,8 @@ def tremor(size=0.8):
 
 
 def panels(figure):
-    """Linear and logarithmic spectrum, residuals, output."""
-    return figure.axes[:4]
+    """Spectrum and residuals."""
+    return figure.axes[:2]
 
 
 def key(figure):
@@ -336,24 +329,16 @@ def key(figure):
     return labels_of(legend)
 
 
-def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
+def test_the_parts_of_a_model_add_up_to_the_fit():
     found = result(components=tremor(), task=on_rung(Isometric(), 2))
     figure = plot.fit(found)
-    linear, logarithmic, _, _ = panels(figure)
-    labels = [label for label in key(figure) if label.endswith("% of power")]
-    assert [label.partition(",")[0] for label in labels] == [
-        "floor",
-        "relaxation",
-        "resonance (all bins)",
-    ]
-    assert sum(int(label.split(", ")[1].split()[0]) for label in labels) == pytest.approx(
-        100, abs=2
-    )
-    top = max(
-        path.vertices[:, 1].max() for area in linear.collections[-3:] for path in area.get_paths()
-    )
-    assert top == pytest.approx(found.fitted.max())
-    assert len(logarithmic.lines) == len(linear.lines) + 3  # a line for each instead
+    labels = [label for label in key(figure) if "%" in label]
+    assert [label.partition(",")[0] for label in labels] == ["slow part", "floor", "tremor"]
+    shares = [float(label.split(", ")[1].split()[0]) for label in labels]
+    assert sum(shares) == pytest.approx(100, abs=1.5)  # two digits each
+    spectrum, _ = panels(figure)
+    total = np.sum([named(spectrum, label).get_ydata() for label in labels], axis=0)
+    np.testing.assert_allclose(total, found.fitted, rtol=1e-12)
 
 
 def of_two_resonances(tremor, **changes):
@@ -370,25 +355,22 @@ def of_two_resonances(tremor, **changes):
     task = on_rung(Isometric(), 3).replace(
         **({"resonance_frequency": 9.22, "resonance_2_frequency": 3.7} | changes)
     )
-    return result(components=parts, task=task, profile=None)
+    return result(components=parts, task=task)
 
 
 def test_the_frequencies_of_resonances_are_marked_in_the_colours_of_their_parts():
     figure = plot.fit(of_two_resonances(0.2))
-    linear, logarithmic, _, _ = panels(figure)
-    for label, where, color in (("resonance", 9.22, plot.GREEN), ("resonance 2", 3.7, plot.PURPLE)):
-        name = f"{label} in the drive: {where:.2f} Hz"
-        assert key(figure).count(name) == 1
-        for ax in (linear, logarithmic):
-            mark = named(ax, name)
-            assert list(mark.get_xdata()) == [where] and (mark.get_marker(), mark.get_color()) == (
-                "^",
-                color,
-            )
-            assert [
-                line.get_color() for line in ax.lines if list(line.get_xdata()) == [where, where]
-            ] == [color]
-    assert not any(label.startswith("harmonic") for label in key(figure))
+    spectrum, _ = panels(figure)
+    for label, where, color in (
+        ("tremor, 20 % (9.22 Hz)", 9.22, plot.GREEN),
+        ("second resonance,", 3.7, plot.PURPLE),
+    ):
+        (words,) = (each for each in key(figure) if each.startswith(label))
+        assert f"({where:g} Hz)" in words and named(spectrum, words).get_color() == color
+        assert [
+            line.get_color() for line in spectrum.lines if list(line.get_xdata()) == [where, where]
+        ] == [color]
+    assert not any(label.startswith("regular rhythm") for label in key(figure))
 
 
 def test_the_words_below_a_fit_of_two_resonances_find_room_in_its_width():
@@ -400,140 +382,115 @@ def test_the_words_below_a_fit_of_two_resonances_find_room_in_its_width():
 
 @pytest.mark.parametrize(
     ("frequency", "share", "words"),
-    [(25.0, 0.2, ["resonance in the drive: 25.00 Hz"]), (9.22, 1e-6, [])],
+    [(25.0, 0.2, ["tremor, 20 % (25 Hz)"]), (9.22, 1e-6, [])],
 )
 def test_a_tremor_outside_the_bins_or_without_power_is_not_marked_there(frequency, share, words):
     ax = panels(plot.fit(of_two_resonances(share, resonance_frequency=frequency)))[0]
-    marks = [line for line in ax.lines if str(line.get_label()).startswith("resonance in")]
-    assert [line.get_label() for line in marks] == words
-    assert all(np.size(line.get_xdata()) == 0 for line in marks)
+    assert [str(x.get_label()) for x in ax.lines if "tremor" in str(x.get_label())] == words
+    assert not [line for line in ax.lines if list(line.get_xdata()) == [frequency, frequency]]
 
 
-def test_fit_draws_the_fitted_spectrum_twice_with_target_and_harmonic():
+def test_fit_draws_the_spectrum_over_logarithmic_axes_with_target_and_harmonic():
     found = result()
-    linear, logarithmic, _, _ = panels(plot.fit(found))
-    for ax, scale in ((linear, "linear"), (logarithmic, "log")):
-        assert (ax.get_xscale(), ax.get_yscale()) == (scale, scale)
-        np.testing.assert_array_equal(
-            named(ax, "data").get_ydata(), found.target.proportional_power
-        )
-        np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
-        held = 100 * np.sum(found.fitted * found.harmonic_share)
-        assert named(ax, f"harmonic: 3.90 Hz, {held:.2g} % of power").get_xdata() == [3.9]
-        assert axes_of(ax) == ("Frequency (Hz)", "Power (fraction per bin)")
+    ax, residuals = panels(plot.fit(found))
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    np.testing.assert_array_equal(
+        named(ax, "measured").get_ydata(), found.target.proportional_power
+    )
+    np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
+    held = found.fitted * found.harmonic_share
+    words = f"regular rhythm, {100 * held.sum():.2g} % (3.9 Hz)"
+    np.testing.assert_array_equal(named(ax, words).get_ydata(), held)
+    assert ax.get_ylabel() == "Power (fraction per bin)"
+    # one frequency axis for both
+    assert residuals.get_xlim() == ax.get_xlim() and residuals.get_xlabel() == "Frequency (Hz)"
+    assert not ax.get_xlabel()
+
+
+def test_a_fit_of_several_targets_has_a_spectrum_and_residuals_of_each_by_name():
+    found = result()
+    found.parts = {"low": found.only, "high": result(components=tremor()).only, "$c$": found.only}
+    figure = plot.fit(found)
+    figure.canvas.draw()
+    assert [ax.get_title("left") for ax in figure.axes[::2]] == [*found.parts]
+    assert len(figure.axes) == 6 and not any("%" in label for label in key(figure))
 
 
 def test_fit_draws_residuals_in_standard_deviations_and_marks_the_large_ones():
     found = result()
-    ax = panels(plot.fit(found))[2]
-    bars = ax.containers[0].patches
-    np.testing.assert_array_equal([bar.get_height() for bar in bars], found.residual)
-    np.testing.assert_allclose(
-        [bar.get_x() + bar.get_width() / 2 for bar in bars], found.frequency_hz
-    )
-    outside = [bar.get_facecolor() == to_rgba(plot.VERMILLION) for bar in bars]
-    assert outside == list(np.abs(found.residual) > 2)
-    explained = [i for i, bar in enumerate(bars) if bar.get_label() == "residual beyond 2 SD"]
-    assert explained == [outside.index(True)]  # stands in the key, once
-    spans = {(p.get_y(), p.get_y() + p.get_height()) for p in ax.patches if p not in bars}
+    _, ax = panels(plot.fit(found))
+    drawn = {}
+    for line in ax.lines:
+        if line.get_marker() == "o":
+            drawn |= {x: (y, line.get_color()) for x, y in line.get_xydata()}
+    assert [drawn[x][0] for x in found.frequency_hz] == list(found.residual)
+    colours = np.where(np.abs(found.residual) > 2, plot.VERMILLION, plot.BLUE)
+    assert [drawn[x][1] for x in found.frequency_hz] == list(colours)
+    spans = {(p.get_y(), p.get_y() + p.get_height()) for p in ax.patches}
     assert spans == {(-1.0, 1.0), (-2.0, 2.0)}
-    assert ax.get_ylabel() == "Residual (SD)"
+    assert ax.get_ylabel() == "Residual\n(SD)"
 
 
-def test_fit_draws_the_simulated_stretch():
+def test_fit_draws_what_was_recorded_beside_what_it_simulated():
     found = result()
-    ax = panels(plot.fit(found))[3]
-    np.testing.assert_array_equal(ax.lines[0].get_xydata().T, found.stretch)
-    assert axes_of(ax) == ("Time (s)", r"Force $F_\mathrm{ext}$ (N)")
-    without_newtons = result(per_newton={"K_w0": 63.0})
-    ax = panels(plot.fit(without_newtons))[3]
-    np.testing.assert_allclose(y_of(ax), found.stretch[1] / np.mean(found.stretch[1]))
-    assert ax.get_ylabel() == "Force / mean"
+    *_, measured, simulated = plot.fit(found).axes
+    for ax, (time, output) in ((measured, found.recorded), (simulated, found.stretch)):
+        np.testing.assert_allclose(x_of(ax), time - time[0])
+        np.testing.assert_allclose(y_of(ax), 100 * output / np.mean(output))
+    assert measured.get_ylim() == simulated.get_ylim()
+    assert axes_of(measured) == ("Time (s)", "Force\n(% of mean)")
+    moving = Target("moving", np.ones(30), quantity="displacement", segments=12)
+    *_, measured, _ = plot.fit(result(target=moving)).axes
+    assert measured.get_ylabel() == "Displacement\n(SD)" and np.std(
+        y_of(measured)
+    ) == pytest.approx(1)
+    bare = np.zeros(0), np.zeros(0)
+    assert len(plot.fit(result(recorded=bare)).axes) == 2  # nothing to compare
 
 
-@pytest.mark.parametrize(
-    ("changes", "title", "closeness", "colour"),
-    [
-        ({}, "vastus-lateralis-26mvc", "χ² per bin 1.18, p = 0.2", _plot_fit.DARK_GREEN),
-        (
-            {"adequate": False, "adequacy_p": 1e-9, "closeness": "chi2 per bin 5.50"},
-            "vastus-lateralis-26mvc\nDoes not describe the data",
-            "χ² per bin 5.50, p <= 0.001",
-            plot.VERMILLION,
-        ),
-        (
-            {"adequate": None, "adequacy_p": None},
-            "vastus-lateralis-26mvc",
-            "χ² per bin 1.21",
-            "black",
-        ),
-    ],
-)
-def test_fit_shows_its_verdict_by_a_label_and_a_colour_and_no_prose(
-    changes, title, closeness, colour
-):
-    figure = plot.fit(result(**changes))
-    assert figure.get_suptitle() == title
-    ax = panels(figure)[2]
-    assert ax.get_title("left") == closeness and ax.title.get_text() == ""
-    assert ax._left_title.get_color() == colour
-    assert not texts(figure)  # numbers and sentences are the report's
-
-
-def test_fit_draws_the_profile_over_the_frequency():
-    found = result()
-    ax = plot.fit(found).axes[4]
-    np.testing.assert_array_equal(x_of(ax), found.profile[0])
-    np.testing.assert_array_equal(y_of(ax), found.profile[1])
-    assert ax.get_title("right") == "harmonic p = 0.08" and ax.get_ylabel() == "Δχ²"
+def test_fit_has_no_verdict_and_no_name_of_a_file():
+    figure = plot.fit(result(adequate=False, adequacy_p=1e-9))
+    assert figure.get_suptitle() == "" and not texts(figure)
+    assert not any(ax.get_title(place) for ax in panels(figure) for place in ("left", "right"))
 
 
 def test_fit_of_a_reconstruction_says_so():
     aim = load_target("slifkin-newell-1999-35mvc")
-    figure = plot.fit(result(target=aim))
-    assert (
-        figure.get_suptitle() == "slifkin-newell-1999-35mvc (reconstructed)"
-        and "data, reconstructed" in key(figure)
-    )
+    assert {"reconstructed", "± 1 SD (assumed)"} <= set(key(plot.fit(result(target=aim))))
 
 
 def test_a_failed_fit_still_shows_the_target_and_the_reason():
     figure = plot.fit(failed())
     figure.canvas.draw()
-    assert figure.get_suptitle() == "vastus-lateralis-26mvc\nNot fitted"
-    assert {"no finite fit", "no finite simulation"} == set(texts(figure))
+    assert texts(figure) == ["no finite fit"]
     assert not any(line.get_label() == "fit" for line in panels(figure)[0].lines)
 
 
 def test_a_fit_without_known_spread_draws_logarithms_without_bands():
     aim = Target("few bins", [0.5, 0.3, 0.2], bins=[2, 3, 4])
     figure = plot.fit(
-        result(target=aim, chi2_per_bin=None, adequate=None, adequacy_p=None, deviation=None)
+        result(
+            target=aim,
+            deviation=None,
+            fitted=aim.proportional_power,
+            harmonic_share=np.zeros(3),
+            components={},
+            frequency_hz=aim.frequency,
+            residual=np.zeros(3),
+        )
     )
     figure.canvas.draw()
-    ax = panels(figure)[2]
-    assert ax.get_ylabel() == "Residual (ln units)" and len(ax.patches) == 3
-    assert ax.get_title("left") == "no χ² (spread unknown)"
+    ax = panels(figure)[1]
+    assert ax.get_ylabel() == "Residual\n(ln)" and not ax.patches
 
 
-@pytest.mark.parametrize(("frequency", "share"), [(25.0, 1e-5), (3.9, 0.0)])
-def test_a_harmonic_outside_the_bins_or_without_power_is_not_marked_there(frequency, share):
-    task = Isometric().replace(harmonic_frequency=frequency)
-    ax = panels(plot.fit(result(task=task, harmonic_share=np.full(30, share))))[0]
-    marks = [line for line in ax.lines if str(line.get_label()).startswith("harmonic")]
-    assert [line.get_label() for line in marks] == ["harmonic: 25.00 Hz, <0.1 % of power"] * (
-        share > 0
-    )
-    assert all(line.get_xdata().size == 0 for line in marks)
-    assert ax.get_xlim()[1] < 13
+def test_without_linear_response_the_harmonic_is_still_drawn():
+    assert any(label.startswith("regular rhythm") for label in key(plot.fit(result(components={}))))
 
 
-def test_letters_of_a_fit_with_a_long_name_are_legible_and_titles_do_not_touch():
+def test_letters_of_a_fit_are_legible_and_do_not_touch():
     figure = plot.fit(result(target=Target("a name " * 20, np.ones(30), segments=12)))
     assert small_words(figure) == ([], [], [])
-    # left of the panels beside them
-    ends = [figure.axes[i]._left_title.get_window_extent().x1 for i in (0, 2)]
-    assert max(ends) < figure.axes[1].get_window_extent().x0
 
 
 @pytest.mark.parametrize(
@@ -554,43 +511,46 @@ def test_numbers_are_printed_to_two_digits_of_their_error(shown, expected):
     assert _plot_numbers.quantity(shown) == expected
 
 
-def steady(count, unit="N"):
+def steady(count, unit="N", tremor=9.0):
     """A report of trials whose numbers are known."""
     names = (
-        "power_0_0.5",
-        "power_above_12",
+        "relative_power_0_0.5",
+        "relative_power_above_12",
         *_plot_steadiness.VARIATIONS.values(),
         *_plot_steadiness.REGULARITY.values(),
     )
 
     def measures(i):
-        return {
+        each = {
             name: Fake(value=0.1 * (k + 1) + 0.01 * i, interval=(0.05 * (k + 1), k + 1.0))
             for k, name in enumerate(names)
         }
+        absolute = {name.removeprefix("relative_"): Fake(**vars(each[name])) for name in names[:2]}
+        seen = Fake(value=tremor, interval=(tremor - 0.5, tremor + 0.4))
+        return each | absolute | {"mean": Fake(value=4.0), "tremor_frequency": seen}
 
     trials = {f"trial {i}": measures(i) for i in range(count)}
-    return Fake(unit=unit, trials=trials, measures=measures(1))
+    each = np.arange(1, 1 + count)[:, None] / F
+    spectrum = F, each, each.mean(axis=0)
+    about = {"unit": unit, "band": (6.0, 12.0), "spectrum": spectrum}
+    return Fake(trials=trials, measures=measures(1), **about)
 
 
-@pytest.mark.parametrize(
-    ("count", "unit", "label"), [(3, "N", "Power (N²)"), (1, "% MVC", "Power ((% MVC)²)")]
-)
-def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
-    figure = plot.steadiness(steady(count, unit))
+@pytest.mark.parametrize("count", [3, 1])
+def test_steadiness_shows_every_trial_and_the_value_of_all(count):
+    found = steady(count)
+    figure = plot.steadiness(found)
     figure.canvas.draw()
-    power, variation, regularity = figure.axes
-    assert power.get_ylabel() == label and power.get_yscale() == "log"
-    assert [tick.get_text() for tick in power.get_xticklabels()] == ["0 to\n0.5", "12 to\n30"]
-    dots = [
-        line
-        for ax in figure.axes
-        for line in ax.lines
-        if line.get_label() == "trials, in their order"
-    ]
-    assert [line.get_ydata().size for line in dots] == ([6, 9, 9] if count > 1 else [])
+    _, power, variation, *regularity = figure.axes
+    assert power.get_ylabel() == "Power (%²)" and power.get_yscale() == "log"
+    assert [tick.get_text() for tick in power.get_xticklabels()] == ["0", "0.5", "30"]
+    words = f"{count} trials, in their order"
+    dots = [line for ax in figure.axes for line in ax.lines if line.get_label() == words]
+    assert [line.get_ydata().size for line in dots] == ([6, 9, 3, 3, 3] if count > 1 else [])
+    np.testing.assert_allclose(power.containers[0].lines[0].get_ydata(), [1.1e3, 2.1e3])
     np.testing.assert_allclose(variation.containers[0].lines[0].get_ydata(), [31, 41, 51])
-    np.testing.assert_allclose(regularity.containers[0].lines[0].get_ydata(), [0.61, 0.71, 0.81])
+    values = [ax.containers[0].lines[0].get_ydata()[0] for ax in regularity]
+    np.testing.assert_allclose(values, [0.61, 0.71, 0.81])
     # the ends of the 95 % intervals, in percent of the mean
     (bars,) = variation.containers[0].lines[2]
     ends = np.array([bar[:, 1] for bar in bars.get_segments()])
@@ -598,16 +558,36 @@ def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
     if count > 1:  # the mean hides no trial
         beside = dots[1].get_xdata()[:, None] - variation.containers[0].lines[0].get_xdata()
         assert np.min(np.abs(beside)) > 0.1
-    assert f"{count} trials" in figure.get_suptitle() or count == 1
 
 
-def test_steadiness_without_a_variation_has_no_empty_panel():
+def test_steadiness_shows_the_spectrum_with_its_peak_or_says_that_there_is_none():
+    found = steady(3)
+    figure = plot.steadiness(found)
+    spectrum = figure.axes[0]
+    _, each, mean = found.spectrum
+    drawn = [line.get_ydata() for line in spectrum.lines[:4]]
+    # in percent of a mean of 4, squared
+    np.testing.assert_allclose(drawn, [*(625 * each), 625 * mean])
+    assert spectrum.get_ylabel() == "Power (%²/Hz)"
+    assert list(spectrum.lines[4].get_xdata()) == [9, 9]
+    spans = {(p.get_x(), p.get_x() + p.get_width()) for p in spectrum.patches}
+    assert spans == {(6, 12), (8.5, 9.4)}
+    assert "tremor, 9.00 Hz (8.50 to 9.40)" in key(figure)
+    figure = plot.steadiness(steady(3, tremor=np.nan))
+    assert "tremor band, 6 to 12 Hz: none seen" in key(figure)
+    assert len(figure.axes[0].lines) == 4
+
+
+def test_steadiness_without_a_variation_is_in_the_unit_of_the_signal():
     report = steady(1, "deg/s")
     for measures in (report.measures, *report.trials.values()):
         for name in _plot_steadiness.VARIATIONS.values():
             measures[name].value, measures[name].interval = np.nan, None
-    titles = [ax.get_title(loc="left") for ax in plot.steadiness(report).axes]
-    assert titles == ["Power by band", "Regularity"]
+    figure = plot.steadiness(report)
+    labels = [ax.get_ylabel() for ax in figure.axes]
+    assert labels == ["Power ((deg/s)²/Hz)", "Power ((deg/s)²)", *_plot_steadiness.REGULARITY]
+    np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), report.spectrum[2])
+    np.testing.assert_allclose(figure.axes[1].containers[0].lines[0].get_ydata(), [0.11, 0.21])
 
 
 def test_starts_are_drawn_in_the_order_of_where_they_ended():
@@ -618,43 +598,6 @@ def test_starts_are_drawn_in_the_order_of_where_they_ended():
     np.testing.assert_allclose(other.get_xydata(), [[3, 1]])
     assert labels_of(ax.get_legend()) == ["3 settled", "1 did not settle"]
     assert not plot.starts(Fake(starts=())).lines
-
-
-@pytest.mark.parametrize("log", [True, False])
-def test_components_add_up_to_the_fit(log):
-    found = result(components=tremor())
-    ax = plot.components(found, log=log)
-    labels = labels_of(ax.get_legend())
-    parts = [label for label in labels if label.endswith(" % of power")]
-    assert [part.partition(",")[0] for part in parts] == [
-        "floor",
-        "relaxation",
-        "resonance (all bins)",
-    ]
-    if log:
-        total = np.sum([np.nan_to_num(named(ax, part).get_ydata()) for part in parts], axis=0)
-    else:
-        # of the areas upon each other the uppermost
-        last = ax.collections[-1].get_paths()[0].vertices
-        total = np.array([last[np.isclose(last[:, 0], x), 1].max() for x in found.frequency_hz])
-    np.testing.assert_allclose(total, found.fitted, rtol=1e-12)
-    np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
-    held = [found.components[part.partition(",")[0].removesuffix(" (all bins)")] for part in parts]
-    shares = [100 * np.sum(found.fitted * share) for share in held]
-    assert parts == [
-        f"{part.partition(',')[0]}, {share:.0f} % of power"
-        for part, share in zip(parts, shares, strict=True)
-    ]
-
-
-def test_components_that_are_not_known_are_refused():
-    with pytest.raises(ValueError, match="the parts of the power are not known"):
-        plot.components(result(components={}))
-    with pytest.raises(ValueError, match="did you mean 'vastus-lateralis-26mvc'"):
-        plot.components(result(), target="vastus")
-    several = Fake(parts={"a": result(), "b": result()})
-    with pytest.raises(ValueError, match="give target= one of a, b"):
-        plot.components(several)
 
 
 def cohort_of(people=6, bins=30, name="p", groups="ab"):
@@ -685,23 +628,44 @@ def test_groups_have_a_mean_spectrum_and_their_numbers():
     last = spectra.collections[-1].get_paths()[0].vertices
     edges = [[f(last[np.isclose(last[:, 0], x), 1]) for x in F] for f in (np.min, np.max)]
     np.testing.assert_allclose(edges, mean.get_ydata() * np.exp([[-1], [1]] * error), rtol=1e-9)
-    assert (
-        corner.get_ylabel() == "corner frequency\n(Hz)"
-        and share.get_ylabel().replace("\n", " ")
-        == "share of variance, 0.5 to 1\N{NO-BREAK SPACE}Hz (ratio)"
+    assert corner.get_ylabel() == "corner frequency\n(Hz)"
+    words = "share of variance, 0.5 to 1\N{NO-BREAK SPACE}Hz (%)"
+    assert share.get_ylabel().replace("\n", " ") == words
+    people = [line.get_ydata() for line in corner.lines if line.get_linestyle() == "-"]
+    np.testing.assert_array_equal(np.ravel(people), [1, 3, 5, 2, 4, 6])
+    means = [container.lines[0].get_ydata()[0] for container in corner.containers]
+    np.testing.assert_allclose(means, [3, 4])
+    np.testing.assert_allclose([c.lines[0].get_ydata()[0] for c in share.containers], [20, 30])
+    (bars,) = corner.containers[0].lines[2]
+    ((low, high),) = [bar[:, 1] for bar in bars.get_segments()]
+    # Student's t of two degrees of freedom, 4.303; the standard error of 1, 3, 5 is 2 / √3
+    np.testing.assert_allclose(
+        [low, high], 3 + 4.3027 * 2 / np.sqrt(3) * np.array([-1, 1]), rtol=1e-4
     )
-    values = [line.get_ydata() for container in corner.containers for line in container.lines[:1]]
-    np.testing.assert_array_equal(values, [[1, 3, 5], [2, 4, 6]])
-    means = [
-        segment[0][1]
-        for lines in corner.collections
-        for segment in lines.get_segments()
-        if len(set(segment[:, 1])) == 1
-    ]
-    assert {3.0, 4.0} <= set(means)
     assert len(plot.groups(cohort_of(bins=20)).axes) == 2  # spectra of different bins have no mean
     with pytest.raises(ValueError, match="nothing to draw"):
         plot.groups(found, quantities=["k_w"])
+
+
+def test_people_who_were_measured_in_several_conditions_are_joined():
+    found = cohort_of(4)
+    once = found.table()
+    again = [
+        row | {"person": row["target"], "condition": condition, "value": row["value"] + add}
+        for condition, add in (("rest", 0.0), ("tired", 2.0))
+        for row in once
+    ]
+    again = [row for row in again if (row["target"], row["condition"]) != ("p0", "tired")]
+    found.table = lambda: again
+    corner, _ = plot.cohort(found, "group").axes
+    corner.figure.canvas.draw()
+    assert [tick.get_text() for tick in corner.get_xticklabels()] == ["rest", "tired"] * 2
+    joined = [line.get_ydata() for line in corner.lines if line.get_linestyle() == "-"]
+    np.testing.assert_array_equal(joined, [[1, np.nan], [3, 5], [2, 4], [4, 6]])
+    places = [line.get_xdata() for line in corner.lines if line.get_linestyle() == "-"]
+    assert places[0][1] < places[2][0]  # groups do not overlap
+    # of one person there is no interval
+    assert len(corner.containers) == 3
 
 
 CELLS = [
@@ -738,6 +702,19 @@ def test_a_study_has_one_key_that_lies_outside_all_spectra():
     assert not any(key.get_window_extent().overlaps(ax.get_window_extent()) for ax in figure.axes)
     # what stands lowest in its column
     assert [bool(ax.get_xlabel()) for ax in figure.axes] == [False, True, True]
+
+
+def test_the_tremor_of_a_person_is_a_dot_on_the_line_of_this_person():
+    study = studied()
+    cell, f = study.cells[-1], study.cells[-1].target.frequency
+    tremor = {"tremor_frequency": Measure(9.0, 0.2, "Hz", "trials", (8.5, 9.5))}
+    cell.target = Target("shaking", 1 / f, segments=[6], measured=tremor)
+    *_, panel = plot.study(study).axes
+    (dot,) = (line for line in panel.lines if line.get_marker() == "o")
+    # between the bins in log power
+    at, own = np.arange(1, 31) / 2.56, cell.target.proportional_power
+    assert dot.get_xdata() == [9.0] and dot.get_color() == plot.VERMILLION
+    assert np.log(dot.get_ydata()[0]) == pytest.approx(np.interp(9.0, at, np.log(own)))
 
 
 def test_a_dollar_in_a_name_is_no_mathematics():
@@ -859,7 +836,11 @@ def identified():
             t: Fake(left=0.1 * k, determined=k < 3, percent=f"{0.98 + k:.2f} %")
             for k, t in enumerate(told)
         }
-        return Fake(name=name, failed=None, singular_values=size * factor, quantities=known)
+        found = size * factor
+        count = int(np.sum(found >= 3.0))
+        return Fake(
+            name=name, failed=None, singular_values=found, determined=count, quantities=known
+        )
 
     designs = [outlook(name, 10.0**i) for i, name in enumerate(names)]
     return Fake(
@@ -869,7 +850,6 @@ def identified():
         names=told,
         open_in_fit=(),
         letter=lambda i: "ABC"[i],
-        threshold=3.0,
         doubt="The fit does not describe its data",
     )
 
@@ -923,7 +903,6 @@ def refitted(
     [
         lambda: plot.simulation(trajectories((3,))),
         lambda: plot.fit(result()),
-        lambda: plot.components(result()).figure,
         lambda: plot.groups(cohort_of()),
         lambda: plot.groups(cohort_of(12, groups=CELLS)),
         lambda: plot.groups(cohort_of(12, 20, groups=CELLS)),
@@ -946,7 +925,6 @@ def refitted(
     ids=[
         "simulation",
         "fit",
-        "components",
         "groups",
         "long groups",
         "unlike bins",
@@ -968,7 +946,7 @@ def test_words_are_legible_in_a_column_of_a_journal_and_do_not_touch(draw):
 
 
 @pytest.mark.parametrize("power", [1.0, 1e-6], ids=["fractions", "small"])
-@pytest.mark.parametrize("draw", [plot.spectrum, plot.target, plot.fit, plot.components])
+@pytest.mark.parametrize("draw", [plot.spectrum, plot.target, plot.fit])
 def test_no_number_of_a_logarithmic_axis_has_a_small_exponent(draw, power):
     """Mathematics and raised digits are drawn at 0.7 of the letters or less: 4.3 points in a column
     of 85 mm."""
@@ -979,7 +957,7 @@ def test_no_number_of_a_logarithmic_axis_has_a_small_exponent(draw, power):
     elif draw is plot.target:
         figure = draw(Target("t", power + 1 / (1 + F**2), segments=12), log=True).figure
     else:
-        figure = draw(result()) if draw is plot.fit else draw(result(), log=True).figure
+        figure = draw(result())
     figure.canvas.draw()
     numbers = []
     for axis in (
@@ -1003,14 +981,25 @@ def test_numbers_of_axes():
     ]
 
 
-def test_small_singular_values_are_counted_and_the_legend_says_so():
+def test_measurements_are_named_below_the_table_which_has_their_combinations():
     figure = plot.identifiability(identified())
-    upper = figure.axes[0]
-    assert key(figure) == ["determined", "not determined", "how many below 0.01"]
-    counts = [text.get_text() for text in upper.texts if text.get_text().isdigit()]
-    assert counts == ["2", "2", "2", "2"]
-    shares = [text.get_text() for text in upper.texts if text.get_text().endswith(" of 7")]
-    assert shares == ["3 of 7", "3 of 7", "4 of 7", "4 of 7"]
+    (table,) = figure.axes
+    assert [tick.get_text() for tick in table.get_xticklabels()] == ["now", "A", "B", "C"]
+    assert [text.get_text() for text in table.texts][:4] == ["3", "3", "4", "4"]
+    assert table.get_yticklabels()[0].get_text() == "combinations (of 7)"
+    said = "\n".join(text.get_text() for part in figure.subfigs for text in part.texts)
+    assert "A  the mean force, known to 2 %" in said and "C  a second force level" in said
+
+
+def test_a_report_of_many_measurements_fits_on_a_page():
+    report = identified()
+    report.designs, report.letter = report.designs * 9, lambda i: f"{i}"
+    report.names = [f"{name}@{target}" for target in range(9) for name in report.names]
+    for outlook in (report.present, *report.designs[:3]):
+        known = outlook.quantities["K_w0"]
+        outlook.quantities = dict.fromkeys(report.names, known)
+    width, height = plot.identifiability(report).get_size_inches()
+    assert 25.4 * width <= 180 and 25.4 * height <= 220
 
 
 @pytest.mark.parametrize("style", ["default", "dark_background"])

@@ -439,8 +439,7 @@ class Recording(Shown, eqx.Module):
         )
 
     def plot(self, settings: SpectrumSettings | str | None = None, ax: Any = None) -> Any:
-        """Draw the trace with its window, and the spectra (Welch, FFT), linear and logarithmic;
-        returns the figure."""
+        """Draw the trace with its window, and the spectra (Welch, FFT); returns the figure."""
         return plot.recording(self, settings, ax)
 
     def _card(self) -> Card:

@@ -24,8 +24,10 @@ from ._measured import (
     FLOATING,
     LEVEL_NAME,
     MEAN,
+    MOTION_BAND,
     RANGES,
     RECORDED,
+    SEEN,
     SLOWEST,
     VARIATION,
     measure_signals,
@@ -59,7 +61,8 @@ class Steadiness(Printed, Result, eqx.Module):
 
     `measures` of all trials together, by name; `trials`, the measures of each by its name, and
     their `durations` [s]; the `unit` and `quantity` of the signal; the `band` [Hz] in which a
-    tremor was looked for; `notices`, sentences on what was done and what to mind.
+    tremor was looked for; the Welch `spectrum`, as frequency [Hz], power of every trial and of all
+    [unit²/Hz]; `notices`, sentences on what was done and what to mind.
     """
 
     measures: dict[str, Measure]
@@ -68,6 +71,7 @@ class Steadiness(Printed, Result, eqx.Module):
     unit: str
     quantity: str | None
     band: tuple[float, float]
+    spectrum: tuple[np.ndarray, np.ndarray, np.ndarray]
     notices: tuple[str, ...]
 
     def __getitem__(self, name: str) -> Measure:
@@ -109,8 +113,8 @@ class Steadiness(Printed, Result, eqx.Module):
         return frame(rows)
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
-        """Draw power by band, coefficients of variation and regularity, every trial as a dot;
-        returns the figure."""
+        """Draw spectrum, power by band, coefficients of variation and regularity, every trial as a
+        dot; returns the figure."""
         return plot.steadiness(self, ax)
 
     def __str__(self) -> str:
@@ -245,7 +249,13 @@ def steadiness(
     notices += _notice_wandering(signals) if few else ()
     notices += _notice_limits(durations, together, quantity, highest)
     notices += () if few else _notice_agreement(own)
-    return Steadiness(together, trials, durations, unit, quantity, band, tuple(notices))
+    fastest = min(MOTION_BAND[1], SEEN * highest)
+    settings = RECORDED.replace(last_bin=int(fastest / RECORDED.resolution))
+    spectra = [recording.spectrum(settings) for recording in each]
+    power = np.stack([np.asarray(one.power) for one in spectra])
+    whole = np.average(power, axis=0, weights=[r.segments(settings) for r in each])
+    spectrum = np.asarray(spectra[0].frequency), power, whole
+    return Steadiness(together, trials, durations, unit, quantity, band, spectrum, tuple(notices))
 
 
 def _with_level(measures: dict[str, Measure], mvc: float | int) -> dict[str, Measure]:

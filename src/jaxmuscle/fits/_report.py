@@ -13,6 +13,7 @@ import numpy as np
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle._common.keys import fold_in
+from jaxmuscle.data._target import Target
 from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.model._noises import with_active_noise
 from jaxmuscle.model._tasks import AbstractTask
@@ -58,6 +59,7 @@ from ._checks import (
 from ._intervals import Interval
 from ._model_choice import find_unseen, harmonic_test
 from ._result import Estimate, FitResult, FittedPart, Rung, Start
+from ._signal_checks import RATE
 from ._stages import Stage, controlled_moments
 from ._verdict import Endpoint, elsewhere
 
@@ -502,6 +504,7 @@ def _parts(
             deviation=statistics.sd if statistics.known else None,
             components=_components(part, settled(task)) if plan.problem.control else {},
             stretch=simulated.stretch,
+            recorded=_first_seconds(target),
             check=check | polish,
             further=further,
             stiffness=(
@@ -509,6 +512,12 @@ def _parts(
             ),
         )
     return parts, notices
+
+
+def _first_seconds(target: Target) -> tuple[np.ndarray, np.ndarray]:
+    """Of the first trial, as long as the simulated stretch; nothing of a bare spectrum."""
+    samples = next(iter(target.signals), np.zeros(0))[: round(STRETCH * RATE)]
+    return np.arange(samples.size) / RATE, samples
 
 
 def _components(part: Part, task: AbstractTask) -> dict[str, np.ndarray]:
@@ -617,7 +626,19 @@ def _failed(problem: FitProblem, common: dict[str, Any], reason: str) -> FitResu
         ]
         nothing, none = np.full(len(part.target.bins), np.nan), (np.zeros(0), np.zeros(0))
         made = FittedPart(
-            part.target, part.task, None, None, nothing, nothing, nothing, None, {}, none, {}, {}
+            part.target,
+            part.task,
+            None,
+            None,
+            nothing,
+            nothing,
+            nothing,
+            None,
+            {},
+            none,
+            none,
+            {},
+            {},
         )
         parts[part.name or part.target.name] = made
     unknown = Identifiability.of_covariance(np.eye(free))

@@ -241,10 +241,16 @@ class SpectrumTable(Table, kw_only=True):
 
 
 class StretchTable(Table, kw_only=True):
-    """A few simulated seconds: `stretch`."""
+    """A few simulated or measured seconds: `stretch`, `recorded`."""
 
     time: Annotated[Numbers, says("Time [s]")]
-    output: Annotated[Numbers, says("Simulated force [N], displacement [m] or acceleration [m/s²]")]
+    output: Annotated[
+        Numbers,
+        says(
+            "Simulated force [N], displacement [m] or acceleration [m/s²]; measured, in the unit of"
+            " the target"
+        ),
+    ]
 
 
 class PartTable(Table, kw_only=True):
@@ -261,6 +267,10 @@ class PartTable(Table, kw_only=True):
     rms_log_error: Annotated[float | None, says("Standard deviation of the log of target over fit")]
     spectrum: Annotated[SpectrumTable, says("Spectra")]
     stretch: Annotated[StretchTable, says("A few simulated seconds")]
+    recorded: Annotated[
+        StretchTable,
+        says("The first seconds of the first recording; empty where only its spectrum is known"),
+    ]
     check: Annotated[
         dict[str, float | int],
         says(
@@ -348,6 +358,7 @@ RELATIVE = {
 }
 ALIASES = {"activation_time": "contraction_time"}
 SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
+TRACES = ("stretch", "recorded")
 STRETCH = ("time", "output")
 SAME_OF_PART = ("chi2_per_bin", "rms_log_error", "check", "further")
 
@@ -429,11 +440,12 @@ class FittedPart(eqx.Module):
     `deviation`, the standard deviation of each log power (None where it is unknown); `components`,
     what share of each bin's power the parts of the model have in linear response: the `relaxation`
     of the active tissue under its noise, the `floor` from noise on the passive one, the `harmonic`,
-    the `resonance`, `resonance_2`; `stretch`, time and output of a few simulated seconds; `check`,
-    how far linear response and nonlinear simulation differ; `further`, residuals of the coefficient
-    of variation and of the mean, as far as they are data [standard deviations], positive where the
-    model is above the data; `stiffness`, the fitted dynamic stiffness [N/m] at the frequencies of
-    the target's.
+    the `resonance`, `resonance_2`; `stretch`, time and output of a few simulated seconds;
+    `recorded`, the same of the first recording in its unit, empty where only its spectrum is known;
+    `check`, how far linear response and nonlinear simulation differ; `further`, residuals of the
+    coefficient of variation and of the mean, as far as they are data [standard deviations],
+    positive where the model is above the data; `stiffness`, the fitted dynamic stiffness [N/m] at
+    the frequencies of the target's.
     """
 
     target: Target
@@ -446,6 +458,7 @@ class FittedPart(eqx.Module):
     deviation: Float[np.ndarray, " bins"] | None
     components: dict[str, Float[np.ndarray, " bins"]]
     stretch: tuple[np.ndarray, np.ndarray]
+    recorded: tuple[np.ndarray, np.ndarray]
     check: dict[str, float | int]
     further: dict[str, float]
     stiffness: Complex[np.ndarray, " points"] | None = None
@@ -601,7 +614,7 @@ def part_to_table(part: FittedPart) -> dict[str, Any]:
             **{field: getattr(part, field) for field in SPECTRUM},
             "components": part.components,
         },
-        "stretch": dict(zip(STRETCH, part.stretch, strict=True)),
+        **{name: dict(zip(STRETCH, getattr(part, name), strict=True)) for name in TRACES},
         "stiffness": (
             None if part.stiffness is None else [np.real(part.stiffness), np.imag(part.stiffness)]
         ),
@@ -620,6 +633,7 @@ def read_part(table: PartTable) -> FittedPart:
         **{field: from_nulls(getattr(spectrum, field)) for field in SPECTRUM},
         components={name: from_nulls(share) for name, share in spectrum.components.items()},
         stretch=(from_nulls(table.stretch.time), from_nulls(table.stretch.output)),
+        recorded=(from_nulls(table.recorded.time), from_nulls(table.recorded.output)),
         stiffness=None
         if stiffness is None
         else np.array(stiffness[0]) + 1j * np.array(stiffness[1]),
@@ -768,6 +782,7 @@ class FitResult(Result, eqx.Module):
     residual = of_only("residual", "Residual of each bin.")
     deviation = of_only("deviation", "Standard deviation of each bin's log power.")
     stretch = of_only("stretch", "Time and output of a few simulated seconds.")
+    recorded = of_only("recorded", "Time and output of the first seconds of the first recording.")
     check = of_only("check", "How far linear response and nonlinear simulation differ.")
     frequency_hz = of_only("frequency_hz", "Frequencies of the bins [Hz].")
 

@@ -296,11 +296,13 @@ class StudyResult(Result, eqx.Module):
     def _drawn(self) -> "_Drawn":
         """What the figure of the quantities shows."""
         known = self._known()
-        groups = {cell.target.name: _group_of(cell) for cell in self.cells}
+        groups = {cell.target.name: cell.group for cell in self.cells}
         rows = [
             {
                 "target": cell.target.name,
-                "group": groups[cell.target.name],
+                "person": cell.person,
+                "condition": cell.condition,
+                "group": cell.group,
                 "quantity": name,
                 "value": e.value,
                 "stderr": e.stderr,

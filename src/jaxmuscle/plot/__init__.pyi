@@ -6,7 +6,6 @@ from ._checks import goodness as goodness
 from ._cohort import cohort as cohort
 from ._cohort import groups as groups
 from ._comparison import comparison as comparison
-from ._components import components as components
 from ._coverage import coverage as coverage
 from ._designed_input import designed_input as designed_input
 from ._fit import fit as fit

@@ -5,17 +5,18 @@ from collections.abc import Collection
 from typing import Any
 
 import numpy as np
+import scipy
 from matplotlib.axes import Axes
 
-from ._numbers import in_words
+from ._numbers import in_print
 from ._study import columns, group_spectra, with_count
 from ._style import (
     BLUE,
-    GREY,
     LINE,
     PALETTE,
     PER_BIN,
     AnyFigure,
+    Style,
     canvas,
     fit_height,
     frequency_axes,
@@ -34,6 +35,7 @@ LONGEST = 20  # letters of it
 LETTER, FREE = 0.055, 6
 ROOM = 16  # letters of all groups' names below a panel; else they stand in a key
 Rows = list[dict[str, Any]]
+MEAN = 0.15  # half the distance of people from their mean
 SHARE = 0.5  # of the targets that must determine a quantity for it to be drawn
 
 
@@ -48,6 +50,9 @@ def cohort(
     """Draws what at least half of the targets determine, `by` "person", "group" or "level"
     (fraction of MVC).
 
+    By person and level with standard errors. By group every person is a dot, joined where there are
+    several conditions, and the mean of the people has its 95 % interval.
+
     `quantities`, only these.
 
     **Raises:** `ValueError` for another `by`, and if there is nothing to draw.
@@ -59,11 +64,13 @@ def cohort(
         result.target.mvc_fraction is None for result in cohort.results.values()
     ):
         raise ValueError("by = 'level': no target states its mvc_fraction")
-    heights = [HEIGHT + (_below(cohort) if by == "person" else 0.0)] * rows_for(len(names))
+    below = {"person": cohort.results, "group": _conditions(cohort), "level": ()}[by]
+    heights = [HEIGHT + _below(below)] * rows_for(len(names))
     fig = canvas(ax, heights)
     _panels(fig, cohort, names, by)
     groups = _groups(cohort)
-    if len(groups) > 1 and not (by == "group" and _short(groups)):
+    named = by == "group" and len(_conditions(cohort)) == 1 and _short(groups)
+    if len(groups) > 1 and not named:
         fit_height(fig, heights, key(fig, columns(groups), plain=True))
     return fig
 
@@ -75,8 +82,8 @@ def groups(
     """Draws the spectra of the groups of a cohort, and what the fits found by group.
 
     Above: every target (thin), the geometric mean of each group with its standard error (thick).
-    Below: what at least half of the targets determine, with standard errors; the grey line is the
-    mean of the group. `quantities`, only these. Where the targets differ in their bins, their
+    Below: what at least half of the targets determine, with the mean of each group and its 95 %
+    interval. `quantities`, only these. Where the targets differ in their bins, their
     spectra have no mean and are left out.
 
     **Raises:** `ValueError` if nothing is determined by half of the targets.
@@ -113,10 +120,10 @@ def _short(groups: list[str]) -> bool:
     return len(groups) * max(len(group or "all") for group in groups) <= ROOM
 
 
-def _below(cohort: Any) -> float:
+def _below(names: Collection[str]) -> float:
     """How much higher [inches] long names make a panel."""
-    longest = max(len(shorten(name, LONGEST)) for name in cohort.results)
-    return max(0.0, LETTER * (longest - FREE)) if len(cohort.results) <= LABELLED else 0.0
+    longest = max((len(shorten(name, LONGEST)) for name in names), default=0)
+    return max(0.0, LETTER * (longest - FREE)) if len(names) <= LABELLED else 0.0
 
 
 def _rows_to_draw(cohort: Any, quantities: Collection[str] | None) -> list[Rows]:
@@ -139,60 +146,89 @@ def _rows_to_draw(cohort: Any, quantities: Collection[str] | None) -> list[Rows]
 
 def _panels(fig: Any, cohort: Any, quantities: list[Rows], by: str) -> None:
     panels, _ = panel_grid(fig, len(quantities))
+    people, groups, conditions = list(cohort.results), _groups(cohort), _conditions(cohort)
     for panel, rows in zip(panels, quantities, strict=True):
-        _panel(panel, rows, list(cohort.results), _groups(cohort), by)
+        factor, label = in_print(rows[0]["quantity"], rows[0]["unit"])
+        panel.set_ylabel(textwrap.fill(label, 18))
+        for number, group in enumerate(groups):
+            here = [row for row in rows if row["group"] == group]
+            style: Style = {
+                "color": PALETTE[number % len(PALETTE)] if len(groups) > 1 else BLUE,
+                "label": shorten(group, 2 * LONGEST) or None,
+            }
+            if by == "group":
+                _group(panel, here, factor, number, conditions, style)
+            else:
+                _each(panel, here, factor, people if by == "person" else None, style)
+        if by == "group":
+            _name_groups(panel, groups, conditions)
+        elif by == "level":
+            panel.set_xlabel("Level (% MVC)")
+        else:
+            _name_people(panel, people)
     fig.align_ylabels()
 
 
-def _panel(ax: Axes, rows: Rows, people: list[str], groups: list[str], by: str) -> None:
-    for number, group in enumerate(groups):
-        here = [
-            row
-            for row in rows
-            if row["group"] == group and (by != "level" or row["mvc_fraction"] is not None)
-        ]
-        value, error = (
-            np.array([row[key] for row in here], dtype=float) for key in ("value", "stderr")
-        )
-        if by == "group":
-            place = number + (
-                np.linspace(-0.25, 0.25, len(here)) if len(here) > 1 else np.zeros(len(here))
-            )
-            if len(here):
-                ax.hlines(value.mean(), number - 0.35, number + 0.35, color=GREY, linewidth=1)
-        else:
-            place = [
-                people.index(row["target"]) if by == "person" else 100 * row["mvc_fraction"]
-                for row in here
-            ]
-        ax.errorbar(
-            place,
-            value,
-            error,
-            fmt="o",
-            markersize=3.5,
-            capsize=2,
-            linewidth=1,
-            color=PALETTE[number % len(PALETTE)] if len(groups) > 1 else BLUE,
-            label=shorten(group, 2 * LONGEST) or None,
-        )
-    ax.set_ylabel(textwrap.fill(in_words(rows[0]["quantity"], rows[0]["unit"]), 18))
-    if by == "level":
-        ax.set_xlabel("Level (% MVC)")
-    elif by == "group":
-        shown = [shorten(group, LONGEST) or "all" for group in groups] if _short(groups) else []
-        ax.set_xticks(range(len(shown)), shown, parse_math=False)
-        ax.set_xlim(-0.6, len(groups) - 0.4)
+def _each(ax: Axes, rows: Rows, factor: float, people: list[str] | None, style: Style) -> None:
+    """Values with their standard errors, by person or, without people, by level."""
+    rows = [row for row in rows if people or row["mvc_fraction"] is not None]
+    value, error = (
+        factor * np.array([row[key] for row in rows], dtype=float) for key in ("value", "stderr")
+    )
+    place = [people.index(row["target"]) if people else 100 * row["mvc_fraction"] for row in rows]
+    ax.errorbar(place, value, error, fmt="o", ms=3.5, capsize=2, lw=1, **style)
+
+
+def _group(
+    ax: Axes, rows: Rows, factor: float, number: int, conditions: list[str], style: Style
+) -> None:
+    """The people of a group, joined where they were measured in several conditions, and beside them
+    the mean of each condition with its 95 % interval (Student's t)."""
+    people = list(dict.fromkeys(row.get("person", row["target"]) for row in rows))
+    table = np.full((len(people), len(conditions)), np.nan)
+    for row in rows:
+        person, condition = row.get("person", row["target"]), row.get("condition", "")
+        table[people.index(person), conditions.index(condition)] = factor * row["value"]
+    at = number * _width(conditions) + np.arange(len(conditions))
+    fine: Style = {"color": style["color"], "alpha": 0.6, "lw": 0.5, "ms": 2.2, "zorder": 2}
+    ax.plot(at - MEAN, table.T, "o-", **fine)
+    for place, column in zip(at + MEAN, table.T, strict=True):
+        known = column[np.isfinite(column)]
+        if len(known) < 2:
+            continue
+        half = scipy.stats.t.ppf(0.975, len(known) - 1) * scipy.stats.sem(known)
+        bold: Style = {"fmt": "o", "ms": 4, "capsize": 2.5, "lw": 1.4, "zorder": 3} | style
+        ax.errorbar(place, known.mean(), half, **bold)
+
+
+def _conditions(cohort: Any) -> list[str]:
+    return list(dict.fromkeys(row.get("condition", "") for row in cohort.table()))
+
+
+def _width(conditions: list[str]) -> float:
+    """From group to group: a gap, where they have several conditions."""
+    return len(conditions) + 0.5 * (len(conditions) > 1)
+
+
+def _name_groups(ax: Axes, groups: list[str], conditions: list[str]) -> None:
+    """The conditions of each group, or where there is one only the groups, whose names stand in a
+    key if they are long."""
+    at = (np.arange(len(groups))[:, None] * _width(conditions) + np.arange(len(conditions))).ravel()
+    names = conditions * len(groups) if len(conditions) > 1 else [g or "all" for g in groups]
+    if len(conditions) == 1 and not _short(groups):
+        at, names = at[:0], []
+    _ticks(ax, at, names, turned=sum(map(len, names)) > ROOM)
+    ax.set_xlim(-0.6, (len(groups) - 1) * _width(conditions) + len(conditions) - 0.4)
+
+
+def _name_people(ax: Axes, people: list[str]) -> None:
+    ax.set_xlim(-0.5, len(people) - 0.5)
+    if len(people) > LABELLED:
+        ax.set_xlabel("Target number")
     else:
-        ax.set_xlim(-0.5, len(people) - 0.5)
-        if len(people) > LABELLED:
-            ax.set_xlabel("Target number")
-            return
-        ax.set_xticks(
-            range(len(people)),
-            [shorten(name, LONGEST) for name in people],
-            rotation=35 if len(people) <= 6 else 60,
-            ha="right",
-            rotation_mode="anchor",
-            parse_math=False,
-        )
+        _ticks(ax, range(len(people)), people, turned=True)
+
+
+def _ticks(ax: Axes, at: Any, names: list[str], *, turned: bool) -> None:
+    style: Style = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"} if turned else {}
+    ax.set_xticks(at, [shorten(name, LONGEST) for name in names], parse_math=False, **style)

@@ -29,10 +29,20 @@ BAND = re.compile(
     r"(?P<kind>band|share|relative_power|power)_(?P<low>[\d.]+|above)_(?P<high>[\d.]+)"
 )
 KINDS = {
-    "band": "power",
+    "band": "share of power",
     "share": "share of variance",
-    "relative_power": "power over mean²",
+    "relative_power": "power",
     "power": "power",
+}
+# what a number without a unit is a fraction of, and how it is printed
+FRACTIONS = {
+    "relative_power": (1e4, "(% of mean)²"),
+    "coefficient_of_variation": (1e2, "% of mean"),
+    "model_coefficient_of_variation": (1e2, "% of mean"),
+    "tremor_size": (1e2, "% of mean"),
+    "share": (1e2, "%"),
+    "band": (1e2, "%"),
+    "level": (1e2, "% of maximum"),
 }
 DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
@@ -50,11 +60,21 @@ def unit_in_print(unit: str, power: int = 0) -> str:
     return " ".join(part for part in (ten, raised if raised != "1" or not ten else "") if part)
 
 
+def in_print(name: str, unit: str) -> tuple[float, str]:
+    """The factor by which an axis shows a quantity, fractions in percent, and the axis's label."""
+    starts = [kind for kind in FRACTIONS if name.startswith(kind)] if unit in ("", "1") else []
+    factor, shown = FRACTIONS[starts[0]] if starts else (1.0, unit)
+    return factor, in_words(name, shown)
+
+
 def in_words(name: str, unit: str) -> str:
-    """A quantity as the label of an axis; what has no unit is a ratio."""
+    """A quantity as the label of an axis, with its unit where it has one."""
     base, at, target = name.partition("@")
-    words = base if base[1:2] == "_" else base.replace("_", " ")
+    words = re.sub(r"_(?![wz](\d|_|$))", " ", base)  # K_w is a symbol
     if found := BAND.fullmatch(base):
         low, high = (12, 30) if found["low"] == "above" else (found["low"], found["high"])
         words = f"{KINDS[found['kind']]}, {low} to {high}\N{NO-BREAK SPACE}Hz"
-    return f"{words}{at}{target} ({'ratio' if unit in ('', '1') else unit_in_print(unit)})"
+    if unit in ("", "1"):
+        return f"{words}{at}{target}"
+    shown = unit_in_print(unit)
+    return f"{words}{at}{target} {shown if shown.startswith('(') else f'({shown})'}"

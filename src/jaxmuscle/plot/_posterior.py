@@ -18,14 +18,15 @@ from ._style import (
     PALETTE,
     PROPORTIONAL,
     SKY,
-    VERMILLION,
     AnyFigure,
     Style,
     axes_or_new,
     canvas,
     fit_height,
+    frequency_axes,
     heading,
-    log_axis,
+    ink,
+    legend,
     styled,
 )
 
@@ -167,11 +168,10 @@ def predictive(found: Any, ax: Axes | None = None, target: str | None = None) ->
         label = f"predicted, {100 * (high - low):.0f} %"
         ax.fill_between(f, *edges, color=SKY, alpha=alpha + 0.1, lw=0, label=label)
     ax.plot(f, np.median(expected, axis=0), color=BLUE, lw=1.2, label="model, median")
-    ax.plot(f, measured, color=VERMILLION, marker="o", ms=3, lw=0, label="target")
-    log_axis(ax, "y")
-    ax.set(xlabel="Frequency (Hz)", ylabel=PROPORTIONAL, xlim=(0, f[-1] + f[0]))
-    ax.set_title(f"{part.target.name}, p = {part.replicates.p_value:.2g}", parse_math=False)
-    ax.legend(frameon=False, loc="lower left")
+    ax.plot(f, measured, color=ink(), marker="o", ms=2.8, lw=0, label="data", zorder=3)
+    frequency_axes(ax, True, PROPORTIONAL)
+    ax.set_xlim(f[0] / 1.15, 1.15 * f[-1])
+    legend(ax, "above")
     return ax
 
 

@@ -31,32 +31,32 @@ DOTS: Style = {"lw": 1.0, "marker": "o", "ms": 2.8}
 @styled
 def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> AnyFigure:
     """Draws a recording: the trace with its window, the window larger, and its spectra (Welch,
-    FFT), linear, logarithmic.
+    FFT).
 
     `settings`: `SpectrumSettings` or a name, as of `Recording.spectrum`.
     """
-    heights = (1.2, 1.4, 1.9)
-    fig, (whole, window, *spectra) = panels(ax, "AA;BB;CD", heights)
+    heights = (1.1, 1.3, 2.0)
+    fig, (whole, window, panel) = panels(ax, "A;B;C", heights)
     whole_trace(whole, recording, "window", color=BLUE, lw=0.7)
     _window(window, recording, settings)
-    for panel, title in ((whole, "Whole recording"), (window, "Window")):
-        panel.margins(x=0)
-        panel.set(title=title, xlabel="Time (s)")
-        panel.set_ylabel(f"{_quantity(recording)} ({recording.unit})", parse_math=False)
+    for trace, title in ((whole, "Whole recording"), (window, "Window")):
+        trace.margins(x=0)
+        trace.set(title=title, xlabel="Time (s)")
+        trace.set_ylabel(f"{_quantity(recording)} ({recording.unit})", parse_math=False)
     welch, fft = recording.spectrum(settings), recording.fft_spectrum(settings)
     band = recording.target("welch", quantity="force", settings=settings).sampling_band()
     label = f"Welch, {recording.segments(settings)} segments"
-    for panel, log in zip(spectra, (False, True), strict=True):
-        f, power = np.asarray(welch.frequency), np.asarray(welch.power)
-        shown = positive(f, log)
-        style: Style = {"color": GREY, "lw": 0.6, "alpha": 0.8, "zorder": 2}
-        panel.plot(fft.frequency, fft.power, label="FFT of the window", **style)
-        if band:
-            edges = (edge[shown] * np.sum(power) for edge in band)
-            area: Style = {"color": BLUE, "alpha": 0.2, "lw": 0, "zorder": 3}
-            panel.fill_between(f[shown], *edges, label="± 1 SD", **area)
-        panel.plot(f[shown], power[shown], color=ink(), label=label, zorder=4, **DOTS)
-        _spectrum_axes(panel, welch.unit, log)
+    f, power = np.asarray(welch.frequency), np.asarray(welch.power)
+    style: Style = {"color": GREY, "lw": 0.6, "alpha": 0.8, "zorder": 2}
+    slow = positive(np.asarray(fft.frequency), True)
+    panel.plot(fft.frequency[slow], fft.power[slow], label="FFT of the window", **style)
+    shown = positive(f, True)
+    if band:
+        edges = (edge[shown] * np.sum(power) for edge in band)
+        area: Style = {"color": BLUE, "alpha": 0.2, "lw": 0, "zorder": 3}
+        panel.fill_between(f[shown], *edges, label="± 1 SD", **area)
+    panel.plot(f[shown], power[shown], color=ink(), label=label, zorder=4, **DOTS)
+    _spectrum_axes(panel, welch.unit)
     return finish(fig, heights, recording.name)
 
 
@@ -66,13 +66,13 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> AnyFigu
     mean.
 
     On the left each whole recording with the window shaded, on the right the window larger,
-    low-passed. Below these the spectra, linear and logarithmic. `settings`: `SpectrumSettings` or a
-    name, as of `Recording.spectrum`.
+    low-passed. Below these the spectra. `settings`: `SpectrumSettings` or a name, as of
+    `Recording.spectrum`.
     """
     if len(trials) == 1:
         return recording(trials[0], settings, ax)
     shown = trials[:MOST]
-    heights = [0.55] * len(shown) + [2.1]
+    heights = [0.7] * len(shown) + [2.1]
     fig = canvas(ax, heights)
     grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
     whole = window = None
@@ -89,18 +89,20 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> AnyFigu
         ):
             panel.set_title(title, pad=2.0, weight="normal", parse_math=False)
             panel.set_xlabel(abscissa if last else "")
-            panel.set_ylabel(f"({one.unit})", parse_math=False)
+            panel.set_ylabel(f"{_quantity(one)}\n({one.unit})", parse_math=False)
             panel.margins(x=0)
             panel.tick_params(labelbottom=last)
             panel.yaxis.set_major_locator(MaxNLocator(2, prune="both", min_n_ticks=2))
     mean, each = trials.spectrum(settings), [one.spectrum(settings) for one in trials]
-    for column, log in enumerate((False, True)):
-        panel = fig.add_subplot(grid[-1, column])
-        for number, one in enumerate(each):
-            label = None if number else f"{len(each)} trials"
-            panel.plot(one.frequency, one.power, color=GREY, lw=0.6, label=label)
-        panel.plot(mean.frequency, mean.power, color=ink(), label="mean", **DOTS)
-        _spectrum_axes(panel, mean.unit, log)
+    panel = fig.add_subplot(grid[-1, :])
+    shown_bins = positive(np.asarray(mean.frequency), True)
+    for number, one in enumerate(each):
+        label = None if number else f"{len(each)} trials"
+        power = one.power[shown_bins]
+        panel.plot(one.frequency[shown_bins], power, color=GREY, lw=0.6, label=label)
+    frequency, power = mean.frequency[shown_bins], mean.power[shown_bins]
+    panel.plot(frequency, power, color=ink(), label="mean", **DOTS)
+    _spectrum_axes(panel, mean.unit)
     more = f", {len(shown)} shown" if len(shown) < len(trials) else ""
     return finish(fig, heights, f"{_quantity(trials[0])} of {len(trials)} trials{more}")
 
@@ -127,6 +129,6 @@ def _window(ax: Axes, recording: Any, settings: Any) -> None:
     ax.axhline(float(np.mean(x)), color=GREY, lw=0.6, ls="--")
 
 
-def _spectrum_axes(ax: Axes, unit: str, log: bool) -> None:
-    frequency_axes(ax, log, f"Power ({density_unit(unit)})")
-    ax.set_title("Logarithmic" if log else "Linear")
+def _spectrum_axes(ax: Axes, unit: str) -> None:
+    frequency_axes(ax, True, f"Power ({density_unit(unit)})")
+    ax.set_title("Spectrum")

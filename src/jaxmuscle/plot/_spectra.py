@@ -122,7 +122,7 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     frequency, power, band = target.frequency, target.proportional_power, target.sampling_band()
     shown = positive(frequency, log)
     if band is not None:
-        label = "± 1 SD (assumed)" if target.provenance == "reconstructed" else "± 1 SD of the data"
+        label = "± 1 SD (assumed)" if target.provenance == "reconstructed" else "± 1 SD"
         ax.fill_between(
             frequency[shown],
             *(edge[shown] for edge in band),

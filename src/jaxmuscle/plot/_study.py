@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 
 from ._style import (
     ACROSS,
+    GREY,
     PALETTE,
     PER_BIN,
     AnyFigure,
@@ -18,6 +19,7 @@ from ._style import (
     frequency_axes,
     panel_grid,
     rows_for,
+    shade,
     shorten,
     styled,
 )
@@ -28,8 +30,8 @@ HALF, LONGEST, TITLE = 26, 40, 24  # letters: half a line of the key, a group's 
 
 @styled
 def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> AnyFigure:
-    """Draws the spectrum of every person (thin) and the geometric mean of each group with its
-    standard error (thick).
+    """Draws the spectrum of every person (thin), with a dot at the peak of a tremor, and the
+    geometric mean of each group with its standard error (thick).
 
     **Arguments:**
 
@@ -69,13 +71,26 @@ def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> A
             if targets[place]:
                 colour = PALETTE[number % len(PALETTE)]
                 group_spectra(panel, targets[place], colour, labels[number], proportional)
+                _mark_peaks(panel, targets[place], colour)
         panel.set_title(shorten(condition, TITLE), parse_math=False)
         frequency_axes(panel, True, ordinate)
         panel.label_outer()
         if place + across >= len(conditions):  # nothing stands below
             panel.set_xlabel("Frequency (Hz)")
             panel.tick_params(axis="x", which="both", labelbottom=True)
+    if any(line.get_marker() == "o" for panel in axes for line in panel.lines):
+        axes[0].plot([], [], "o", color=GREY, ms=3.5, label="tremor of a person")
     return finish(fig, heights, columns=columns(labels), plain=True)
+
+
+def _mark_peaks(ax: Axes, targets: list[Any], colour: str) -> None:
+    """The people's tremors, on their lines, which are drawn last but the mean of the group."""
+    lines = ax.lines[-1 - len(targets) : -1]
+    for target, line in zip(targets, lines, strict=True):
+        where = target.measured["tremor_frequency"].value
+        if np.isfinite(where):
+            height = np.exp(np.interp(where, target.frequency, np.log(line.get_ydata())))
+            ax.plot(where, height, "o", color=colour, ms=3.5, mec=shade(0.0), mew=0.5, zorder=5)
 
 
 def with_count(group: str, *numbers: int) -> str:
