@@ -29,7 +29,7 @@ A parameter has the name of this table wherever you write it:
 | to | write |
 |---|---|
 | make a task with it | `jm.Isometric(k_w=4e5, noise="pink")` |
-| read it | `task["k_w"]`, `task.k_w`, `result["k_w"]` |
+| read it | `task["k_w"]`, `task.k_w`, `result.parameters["k_w"]` |
 | change it | `task.replace(k_w=4e5)` |
 | say how it is fitted | `free=("k_w",)`, `fix={"k_w": 4e5}`, `priors={"k_w": 0.5}`, `bounds={"k_w": (1e5, 1e6)}` |
 | do the same on the command line | `--free k_w`, `--fix k_w=4e5` |
