@@ -187,7 +187,8 @@ def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None
         cells = [plain(cohort.groups.get(name, ""))] * grouped + [
             _cell(result.derived.get(q)) for q in SHOWN
         ]
-        chi2 = "" if result.chi2_per_bin is None else f"{result.chi2_per_bin:.2f}"
+        judged = result.adequacy
+        chi2 = "" if judged is None else f"{judged.chi2 / result.data:.2f}"
         chi2 = f"[bold red]{chi2}*[/]" if result.adequate is False else chi2
         table.add_row(plain(name), *cells, chi2 if result.success else "[bold red]failed[/]")
     out.print(table)
