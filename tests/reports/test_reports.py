@@ -15,6 +15,7 @@ from jaxmuscle._common.figures import pixels_of
 from jaxmuscle.commands import cohort as cohort_command
 from jaxmuscle.commands.console import write_fit
 from jaxmuscle.reports import fit_report, posterior_report, study_report
+from jaxmuscle.reports._ladder_text import format_p
 from jaxmuscle.reports._pages import KINDS
 from jaxmuscle.reports._study_text import difference_in_words, p_in_words
 
@@ -106,6 +107,13 @@ def test_of_a_cohort(tmp_path):
     text, _ = told(tmp_path)
     assert f"{HOSTILE} | <b>old</b> | corner_frequency | 0.333 ± 0.01 | Hz" in text
     assert f"not fitted: no file {HOSTILE}" in text and "What differs between groups" in text
+    result = results[HOSTILE]
+    chi2 = result.adequacy.chi2 / result.data
+    assert f"| {HOSTILE} | <b>old</b> | 0.333 ± 0.010 | {chi2:.2f} | 0.86 | 0.4 | described" in text
+    printed = str(found).splitlines()
+    assert printed[0].startswith("COHORT  3 targets (<b>old</b> 1; young 1)")
+    assert any(line.endswith(f"{chi2:.2f} (0.86)  0.4  described") for line in printed)
+    assert f"  not fitted: c: no file {HOSTILE}" in " ".join(str(found).split("\n    "))
     assert not (tmp_path / "a" / "report.html").exists()
 
 
@@ -140,9 +148,12 @@ def test_the_headline_of_a_study_has_the_colour_of_its_worst_fit(rejected, kind,
     (headline,) = (g["class"] for _, g in seen.elements if "verdict" in g.get("class", ""))
     assert headline == f"verdict {kind}"
     result = study.cohort.results["old1, tired"]
-    each = (result.adequacy.chi2 / result.data, result.adequacy.expected / result.data)
-    row = " | ".join(["old1, tired", *([] if rejected else ["described"])])
-    assert row in text and " | ".join(f"{x:.2f}" for x in each) in text.split("The fits")[1]
+    chi2, expected = (
+        f"{x / result.data:.2f}" for x in (result.adequacy.chi2, result.adequacy.expected)
+    )
+    said = f"not described: {result.adequacy.misfit}" if rejected else "described"
+    row = f"old1, tired | {chi2} | {expected} | {format_p(result.adequacy.p)} | {said}"
+    assert row in text.split("The fits")[1]
 
 
 @pytest.mark.parametrize(

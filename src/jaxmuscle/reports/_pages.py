@@ -11,6 +11,7 @@ from jaxmuscle._common import pages
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.pages import Html
 
+from ._cohort_text import judged_in_words
 from ._ladder_text import format_p
 from ._study_text import (
     GLOSS,
@@ -319,18 +320,10 @@ def _differences(study: "StudyResult") -> list[Html]:
 
 def _fits(cohort: "CohortResult") -> list[Html]:
     """What the verdict on each fit is, those that are not described first."""
-    rows = []
-    for name, result in cohort.results.items():
-        judged = result.adequacy
-        if judged is None or not result.success:
-            rows.append((name, result.verdict, "", "", ""))
-            continue
-        said = "described" if judged.adequate else f"not described: {judged.misfit}"
-        each = (judged.chi2 / result.data, judged.expected / result.data)
-        rows.append((name, said, *(f"{x:.2f}" for x in each), format_p(judged.p)))
-    rows += [(name, f"not fitted: {why}", "", "", "") for name, why in cohort.failed.items()]
-    rows.sort(key=lambda row: row[1] == "described")
-    columns = ("person and condition", "by the model", "chi² per bin", "expected", "p")
+    rows = [(name, *judged_in_words(result)) for name, result in cohort.results.items()]
+    rows += [(name, "", "", "", f"not fitted: {why}") for name, why in cohort.failed.items()]
+    rows.sort(key=lambda row: row[-1] == "described")
+    columns = ("person and condition", "chi2 per bin", "expected", "p", "by the model")
     return [
         pages.heading("The fits"),
         pages.folded(f"{len(rows)} fits", pages.table(columns, rows)),
