@@ -434,6 +434,18 @@ def test_a_study_of_two_groups_and_two_conditions_fits_a_terminal(recorded):
     assert max(map(len, str(named).splitlines()[3:])) <= 80
 
 
+def test_the_methods_say_what_was_subtracted():
+    """A level at rest and a straight line, of a recording that had them; else nothing."""
+    words = ("sensor at rest was subtracted", "straight line through the analysed part")
+    study = made_study()
+    assert not any(word in study.methods() for word in words)
+    force = 3 + np.concatenate([0.001 * np.sin(np.arange(300.0)), forces()[0]])
+    target = jm.data.Recording(force, 100.0, unit="N", detrend=True).steady().target("held")
+    cells = (*study.cells, Cell("held", "old", "rest", 1, (100.0,), target))
+    held = StudyResult(study.cohort, cells, study.aic, study.options, "s.csv")
+    assert all(word in held.methods() for word in words)
+
+
 def test_one_chi2_is_stated_everywhere(tmp_path):
     """That of the verdict, over the data it counts, and not that of the drawn line."""
     study = made_study(rejected=("old1, tired",))

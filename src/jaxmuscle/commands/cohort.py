@@ -133,10 +133,10 @@ def _write(
         write_text(folder / "differences.csv", csv_text(_columns(differences)))
     if any(row["stderr"] is not None for row in cohort.table()):
         figure = jm.plot.groups(cohort) if len(set(cohort.groups.values())) > 1 else cohort.plot()
-        cohort_report(cohort, figure, folder, places)
+        cohort_report(cohort, figure, folder)
         write_figure(figure, folder, "cohort", formats)
     else:
-        cohort_report(cohort, None, folder, places)
+        cohort_report(cohort, None, folder)
     fits = {name: str(places[name] / "fit.json") for name in cohort.results}
     record(
         {

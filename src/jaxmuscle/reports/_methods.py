@@ -69,6 +69,7 @@ def study_methods(study: "StudyResult") -> str:
             f" {range_of(rates)} Hz."
         ),
         _parts(study, sum(trials)),
+        *_subtracted(study),
         _prepared(target.settings),
         _measured(target, several=max(trials) > 1),
         f"{_welch(target.settings)}, with {range_of(segments)} segments per {whose}.",
@@ -103,6 +104,19 @@ def _parts(study: "StudyResult", number: int) -> str:
         " over 1 s stayed within 10 % of the contraction level, without one second beside each"
         f" ramp{others}.{long}"
     )
+
+
+def _subtracted(study: "StudyResult") -> list[str]:
+    """What was subtracted from recordings, as their notices say."""
+    notices = [notice for cell in study.cells for notice in cell.target.notices]
+    said = []
+    if any(
+        "This was subtracted" in notice or "subtracted as asked" in notice for notice in notices
+    ):
+        said.append("The level of the sensor at rest was subtracted where it was not zero.")
+    if any("the straight line through" in notice for notice in notices):
+        said.append("The straight line through the analysed part was subtracted.")
+    return said
 
 
 def _model(study: "StudyResult") -> list[str]:

@@ -127,8 +127,11 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
             PARAMETERS,
             rows["not determined"],
             said="Do not interpret these values.",
+            summary=f"{len(rows['not determined'])} values",
         ),
-        *_table("What was fixed", PARAMETERS, rows["fixed"]),
+        *_table(
+            "What was fixed", PARAMETERS, rows["fixed"], summary=f"{len(rows['fixed'])} values"
+        ),
     ]
     if methods := result.methods():
         body += [pages.heading("For your methods section"), pages.paragraph(methods)]
@@ -169,9 +172,7 @@ def _tried(result: "FitResult") -> list[Html]:
     )
 
 
-def cohort_report(
-    cohort: "CohortResult", figure: Any | None, folder: Path, places: dict[str, Path]
-) -> None:
+def cohort_report(cohort: "CohortResult", figure: Any | None, folder: Path) -> None:
     """Write report.html of a cohort."""
     numbers = [
         (
@@ -202,7 +203,6 @@ def cohort_report(
         )
         for d in cohort.differences()
     ]
-    fits = "; ".join(f"`{place / 'fit.json'}`" for place in places.values())
     body += [
         *_table(
             "What differs between groups",
@@ -224,7 +224,7 @@ def cohort_report(
                 "Fit a target alone for the checks that a cohort leaves out: `jaxmuscle fit"
                 " TARGET`.",
                 "Do not interpret the numbers of a target that the model does not describe.",
-                f"All numbers are in cohort.csv; each fit is in {fits}.",
+                "All numbers are in cohort.csv; each fit is in the folder of its target.",
             ),
         ),
     ]
