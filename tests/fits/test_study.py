@@ -432,6 +432,11 @@ def test_a_study_of_two_groups_and_two_conditions_fits_a_terminal(recorded):
     long = [cell._replace(group=90 * "g") for cell in cells]
     named = StudyResult(study.cohort, tuple(long), study.aic, OPTIONS, "s.csv")
     assert max(map(len, str(named).splitlines()[3:])) <= 80
+    after = [cell._replace(condition=cell.condition.replace("tired", 40 * "t")) for cell in cells]
+    options = OPTIONS | {"quantities": ["mean"]}
+    below = str(StudyResult(study.cohort, tuple(after), {}, options, "s.csv")).splitlines()
+    row = below.index(f"  mean: {40 * 't'} - rest")  # its numbers are whole, in the next line
+    assert below[row + 1].startswith("    ") and below[row + 1].endswith("  4")
 
 
 def test_the_methods_say_what_was_subtracted():

@@ -118,10 +118,15 @@ def _comparisons(found: list[Difference], study: "StudyResult", head: str = "") 
         size = "{} ({})".format(*difference_in_words(d))
         of = f" of {sum(_people(d)) + d.left_out}" * bool(d.left_out)
         rows.append((name, size, p_in_words(d.p_corrected), n_in_words(d) + of))
-    wide = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
-    return [
-        "".join(f"{cell:<{w}}" for cell, w in zip(row, wide, strict=True)).rstrip() for row in rows
-    ]
+    if not rows:
+        return []
+    name, *wide = (max(map(len, column)) + 2 for column in zip(*rows, strict=True))
+    below = name + sum(wide) - 2 > WIDTH  # of long names the numbers stand in a line of their own
+    lines = []
+    for first, *cells in rows:
+        said = "".join(f"{cell:<{w}}" for cell, w in zip(cells, wide, strict=True)).rstrip()
+        lines += [first, f"    {said}"] if below else [f"{first:<{name}}{said}"]
+    return lines
 
 
 def clearest_first(study: "StudyResult") -> list[Difference]:
