@@ -40,6 +40,7 @@ def test_texts_are_no_markup(tmp_path):
         pages.table(["a", HOSTILE], [(HOSTILE, "2")]),
         pages.settings_table({HOSTILE: {HOSTILE: [HOSTILE, 1.0, None, True]}}),
         pages.picture(figure, HOSTILE),
+        pages.folded(HOSTILE, pages.code(HOSTILE)),
     ]
     plt.close(figure)
     pages.write_page(tmp_path / "page.html", HOSTILE, body)
@@ -62,6 +63,7 @@ def test_texts_are_no_markup(tmp_path):
             "div",
         ),
         *("table", "thead", "tbody", "tr", "th", "td", "figure", "img", "figcaption"),
+        *("details", "summary"),
     }
     assert {name for _, given in seen.elements for name in given} <= {
         "lang",
@@ -76,7 +78,7 @@ def test_texts_are_no_markup(tmp_path):
         "alt",
         "src",
     }
-    assert seen.words.count(HOSTILE) == 11
+    assert seen.words.count(HOSTILE) == 13
     assert [given["src"][:26] for tag, given in seen.elements if tag == "img"] == [
         "data:image/svg+xml;base64,"
     ]

@@ -104,7 +104,7 @@ def test_a_study_is_overwritten_only_with_force(table, tmp_path, monkeypatch):
     )
     assert (asked["spectrum"], asked["skip_rows"], asked["time"]) == ("slow", 2, "clock")
     assert not {"max_gap", "axis"} & set(asked)  # of study.toml, if it states them
-    assert "Study: 10 people in 2 groups" in first.stdout and "differences.csv" in first.stdout
+    assert "STUDY  10 people in 2 groups" in first.stdout and "differences.csv" in first.stdout
     before = (out / "study.json").read_bytes()
     again = command(table, "--out", out)
     assert again.exit_code == 2 and "overwrite it with --force" in again.stderr
@@ -118,7 +118,8 @@ def test_steadiness_of_a_study_is_its_measured_part(table, tmp_path):
     result = CliRunner().invoke(app, list(map(str, arguments)), env={"COLUMNS": "300"})
     assert result.exit_code == 0, result.stderr
     found = jm.run_study(table, fit=False, rate=100.0, window=(1.0, 11.0))
-    assert "Table 1: mean ± SD of people" in result.stdout and "model" not in result.stdout
+    assert "MEASURED  mean ± SD of people" in result.stdout and "MODEL" not in result.stdout
+    assert f"Written: {out}/report.html, " in result.stdout
     written = pandas.read_csv(out / "table1.csv", keep_default_na=False)
     assert list(written["quantity"]) == [row["quantity"] for row in found.table_1()]
     values = written["mean"].replace("", "nan").astype(float)

@@ -2,9 +2,7 @@
 intervals."""
 
 import functools
-import io
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -14,13 +12,11 @@ import pytest
 import scipy.stats
 from elsewhere import Pickled
 from refits import without_intervals
-from rich.console import Console
 from test_fit import true_derived
 from test_result import made_result
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
-from jaxmuscle.commands import cohort as _cli_cohort
 from jaxmuscle.commands.main import app
 from jaxmuscle.fits import Estimate
 from jaxmuscle.fits._result import Adequacy
@@ -301,20 +297,21 @@ def test_bad_arguments(targets, options, message):
         jm.fit_cohort(targets, **options)
 
 
-def test_the_printed_table_fits_80_columns_and_shortens_no_number(monkeypatch):
-    small = jm.fits.Estimate(1.99e-4, "1", 6e-5, False, True)
-    result = made_result(derived={name: small for name in _cli_cohort.SHOWN})
+def test_the_printed_table_fits_80_columns_and_shortens_no_number():
+    """Numbers that the data do not determine, and those of a rejected model, are not in it."""
+    small = jm.fits.Estimate(1.99e-4, "Hz", 6e-5, False, True)
+    derived = {"corner_frequency": small, "harmonic_frequency": jm.fits.Estimate(7.0, "Hz", None)}
     names = {"vastus-lateralis-26mvc": "knee", "fdi-abduction-45mvc": "finger"}
-    cohort = jm.fits.CohortResult(dict.fromkeys(names, result), names, {})
-    console = Console(width=80, file=io.StringIO(), color_system=None)
-    monkeypatch.setattr(_cli_cohort, "out", console)
-    _cli_cohort._show(cohort, Path("out"), {name: Path("out") / name for name in names})
-    printed = console.file.getvalue()
-    assert printed.count("0.000199±6e-05") == 2 * len(_cli_cohort.SHOWN) and "…" not in printed
-    assert max(map(len, printed.splitlines())) <= 80
-    assert [line.split()[-1] for line in printed.splitlines()[2:5]] == ["chi²", "per", "bin"]
-    words = printed.partition("chi² per")[1:]
-    assert "chi² per bin: squared distance of spectrum and fit" in " ".join("".join(words).split())
+    cohort = jm.fits.CohortResult(dict.fromkeys(names, made_result(derived=derived)), names, {})
+    lines = str(cohort).splitlines()
+    assert max(map(len, lines)) <= 80 and "harmonic" not in str(cohort)
+    rows = [line for line in lines if line.startswith(tuple(f"  {name}" for name in names))]
+    assert len(rows) == 2 and all("0.000199±0.000060" in row for row in rows)
+    assert all(row.split()[-4:] == ["0.90", "(0.86)", "0.4", "described"] for row in rows)
+    misses = made_result(derived=derived, adequacy=Adequacy(145.0, 25.0, 0.001, "too little"))
+    rejected = str(jm.fits.CohortResult(dict.fromkeys(names, misses), names, {}))
+    words = " ".join(rejected.split())
+    assert "0.000199" not in words and "not described: too little" in words
 
 
 def test_a_figure_needs_a_known_way_and_levels():

@@ -132,7 +132,11 @@ def test_what_a_fit_does_not_determine_is_left_out_and_counted():
     assert groups["rest"].members == (PEOPLE, PEOPLE) and groups["rest"].left_out == 0
     (within,) = of(study, "conditions")
     assert within.members == (2 * PEOPLE - 1,) * 2 and within.left_out == 1
-    assert "left out" in str(study) and "selection" in study.methods()
+    words = " ".join(str(study).split())
+    assert "corner_frequency, tired: old - young" in words and " 5+4 of 10 " in words
+    assert study.missing() == {"corner_frequency": 1}
+    assert "NOT KNOWN  corner_frequency in 1 of 20" in str(study)
+    assert "were left out: in 3 of 4 comparisons, of at most 1 person." in study.methods()
 
 
 def test_the_numbers_of_a_rejected_model_are_left_out_and_what_is_measured_is_not():
@@ -238,11 +242,11 @@ def test_the_folder(tmp_path):
         and table["aic"] == {"0": 10.0, "1": -3.5}
     )
     told = str(made_study(quantities=["resonance_share"]))
-    assert "Comparisons of what is measured: none" in told
+    assert "DIFFERENCES  none: a comparison needs two people on each side" in told
     methods = " ".join((tmp_path / "methods.txt").read_text().split())
     for said in (
-        "10 people in 2 groups (young 5, old 5) in 2 conditions",
-        "40 recordings, 2 per person",
+        "10 people in 2 groups (young 5; old 5) in 2 conditions (rest; tired)",
+        "40 recordings, 2 per person and condition, sampled at 100 Hz",
         "Holm",
         "paired t test",
         "Welch",
@@ -407,10 +411,56 @@ def test_table_1_is_what_scipy_says_of_the_same_samples(recorded):
                     (row["mean"], row["sd"]), (np.mean(values), np.std(values, ddof=1)), rtol=1e-9
                 )
                 assert (row["n"], row["people"]) == (2, 2)
-    told = str(study)
-    assert "Table 1: mean ± SD of people" in told and "tremor seen in" in told
-    assert "3 of conditions" not in told and "1 of conditions" in told
-    assert "A tremor from 6 to 12 Hz" in study.methods() and "rheological" not in study.methods()
+    lines = str(study).splitlines()
+    heads = [line.split()[0] for line in lines if not line.startswith(" ")]
+    assert heads == ["STUDY", "MEASURED", "DIFFERENCES"] and len(lines) <= 22
+    (seen,) = (line.split()[3:] for line in lines if line.startswith("  tremor seen in"))
+    assert seen == 4 * ["0", "of", "2"] and "tremor frequency" not in str(study)
+    methods = study.methods()
+    assert "a peak from 6 to 12 Hz" in methods and "rheological" not in methods
+    assert "Recordings were analysed as a whole. They were 12 s long." in methods
+
+
+def test_a_study_of_two_groups_and_two_conditions_fits_a_terminal(recorded):
+    """With the line that says what was written; a longer name is cut, and no line is longer."""
+    study = made_study(left_out=("old1, tired",))
+    cells = jm.run_study(recorded / "study.toml", fit=False).cells
+    whole = StudyResult(study.cohort, cells, study.aic, OPTIONS | {"quantities": None}, "s.csv")
+    lines = str(whole).splitlines()
+    assert len(lines) <= 22 and max(map(len, lines)) <= 80
+    assert sum("y, tired" in line for line in lines[:4]) == 1  # all four columns side by side
+    long = [cell._replace(group=90 * "g") for cell in cells]
+    named = StudyResult(study.cohort, tuple(long), study.aic, OPTIONS, "s.csv")
+    assert max(map(len, str(named).splitlines()[3:])) <= 80
+    after = [cell._replace(condition=cell.condition.replace("tired", 40 * "t")) for cell in cells]
+    options = OPTIONS | {"quantities": ["mean"]}
+    below = str(StudyResult(study.cohort, tuple(after), {}, options, "s.csv")).splitlines()
+    row = below.index(f"  mean: {40 * 't'} - rest")  # its numbers are whole, in the next line
+    assert below[row + 1].startswith("    ") and below[row + 1].endswith("  4")
+
+
+def test_the_methods_say_what_was_subtracted():
+    """A level at rest and a straight line, of a recording that had them; else nothing."""
+    words = ("sensor at rest was subtracted", "straight line through the analysed part")
+    study = made_study()
+    assert not any(word in study.methods() for word in words)
+    force = 3 + np.concatenate([0.001 * np.sin(np.arange(300.0)), forces()[0]])
+    target = jm.data.Recording(force, 100.0, unit="N", detrend=True).steady().target("held")
+    cells = (*study.cells, Cell("held", "old", "rest", 1, (100.0,), target))
+    held = StudyResult(study.cohort, cells, study.aic, study.options, "s.csv")
+    assert all(word in held.methods() for word in words)
+
+
+def test_one_chi2_is_stated_everywhere(tmp_path):
+    """That of the verdict, over the data it counts, and not that of the drawn line."""
+    study = made_study(rejected=("old1, tired",))
+    for result in study.cohort.results.values():
+        assert result.chi2_per_bin == 0.9  # of the drawn line
+    rows = {(r["person"], r["condition"]): r for r in study.table() if r["kind"] == "model"}
+    row = rows["old1", "tired"]
+    assert row["chi2_per_bin"] == pytest.approx(REJECTED.chi2 / 29)
+    assert row["chi2_expected"] == pytest.approx(REJECTED.expected / 29)
+    assert f"chi2 per bin {row['chi2_per_bin']:.2f}" in study.cohort.results["old1, tired"].verdict
 
 
 def test_all_recordings_of_a_study_have_one_unit(recorded):
@@ -488,7 +538,7 @@ def test_a_whole_study_as_the_page_does_it(recorded, monkeypatch):
     assert rung.chosen and rung.aic == pytest.approx(alone.ladder[0].aic, abs=1e-3)
     assert np.isclose(found.aic[0], sum(r.ladder[0].aic for r in found.cohort.results.values()))
     assert "with the same model (slow part + regular rhythm)" in found.methods()
-    assert "Study: 4 people in 2 groups (x 2, y 2) in 2 conditions (rest, tired)" in str(found)
+    assert "STUDY  4 people in 2 groups (x 2; y 2) in 2 conditions (rest; tired)" in str(found)
     assert {"people.csv", "study.json", "spectra.png", "methods.txt"} <= {
         p.name for p in (recorded / "out/study").iterdir()
     }

@@ -15,7 +15,9 @@ from jaxmuscle._common.figures import pixels_of
 from jaxmuscle.commands import cohort as cohort_command
 from jaxmuscle.commands.console import write_fit
 from jaxmuscle.reports import fit_report, posterior_report, study_report
-from jaxmuscle.reports._study_text import difference_in_words
+from jaxmuscle.reports._ladder_text import format_p
+from jaxmuscle.reports._pages import KINDS
+from jaxmuscle.reports._study_text import difference_in_words, p_in_words
 
 
 @pytest.fixture(autouse=True)
@@ -105,19 +107,60 @@ def test_of_a_cohort(tmp_path):
     text, _ = told(tmp_path)
     assert f"{HOSTILE} | <b>old</b> | corner_frequency | 0.333 ± 0.01 | Hz" in text
     assert f"not fitted: no file {HOSTILE}" in text and "What differs between groups" in text
+    result = results[HOSTILE]
+    chi2 = result.adequacy.chi2 / result.data
+    assert f"| {HOSTILE} | <b>old</b> | 0.333 ± 0.010 | {chi2:.2f} | 0.86 | 0.4 | described" in text
+    printed = str(found).splitlines()
+    assert printed[0].startswith("COHORT  3 targets (<b>old</b> 1; young 1)")
+    assert any(line.endswith(f"{chi2:.2f} (0.86)  0.4  described") for line in printed)
+    assert f"  not fitted: c: no file {HOSTILE}" in " ".join(str(found).split("\n    "))
     assert not (tmp_path / "a" / "report.html").exists()
 
 
 def test_of_a_study(tmp_path):
-    study = made_study()
+    """The figures, then the tables; n and left out in every row; the clearest comparison first."""
+    study = made_study(left_out=("old1, tired",))
     study_report(study, tmp_path)
-    text, _ = told(tmp_path)
-    smallest = min(study.differences(), key=lambda d: (d.p_corrected, d.p))
-    said, number = difference_in_words(smallest)
-    assert f"people | {said} | {number} | {smallest.p:.2g}" in text  # the clearest first
-    assert f"{smallest.quantity}, change {smallest.where}: {smallest.b} - {smallest.a}" == said
-    assert "Table 1: mean ± SD of people | young, rest | young, tired | old, rest" in text
+    text, seen = told(tmp_path)
+    tags = [tag for tag, _ in seen.elements]
+    assert tags.index("img") < tags.index("table")
+    assert "CV: coefficient of variation" in text and "| young, rest (n = 5) |" in text
+    for kind in ("groups", "conditions", "interaction"):
+        found = [d for d in study.differences() if d.kind == kind]
+        first = min(found, key=lambda d: (d.p_corrected, d.p))
+        number, interval = difference_in_words(first)
+        where = [first.where] * bool(first.where)
+        n = "9" if kind == "conditions" else "+".join(map(str, first.members))
+        p = [p_in_words(p) for p in (first.p, first.p_corrected)]
+        cells = [first.quantity, *where, f"{first.b} - {first.a}", number, interval, *p, n]
+        row = " | ".join([*cells, str(first.left_out)])
+        assert row in text.split(KINDS[kind][0])[1], row
     assert study.methods() in text and "people.csv and differences.csv" in text
+
+
+@pytest.mark.parametrize(
+    ("rejected", "kind"), [((), "yes"), (("old1, tired",), "no")], ids=["all", "but one"]
+)
+def test_the_headline_of_a_study_has_the_colour_of_its_worst_fit(rejected, kind, tmp_path):
+    study = made_study(rejected=rejected)
+    study_report(study, tmp_path)
+    text, seen = told(tmp_path)
+    (headline,) = (g["class"] for _, g in seen.elements if "verdict" in g.get("class", ""))
+    assert headline == f"verdict {kind}"
+    result = study.cohort.results["old1, tired"]
+    chi2, expected = (
+        f"{x / result.data:.2f}" for x in (result.adequacy.chi2, result.adequacy.expected)
+    )
+    said = f"not described: {result.adequacy.misfit}" if rejected else "described"
+    row = f"old1, tired | {chi2} | {expected} | {format_p(result.adequacy.p)} | {said}"
+    assert row in text.split("The fits")[1]
+
+
+@pytest.mark.parametrize(
+    ("p", "words"), [(2e-5, "<0.001"), (0.0123, "0.012"), (0.5, "0.50"), (1.0, "1.00"), (None, "")]
+)
+def test_p_values_have_the_digits_of_a_paper(p, words):
+    assert p_in_words(p) == words
 
 
 def posterior(success):

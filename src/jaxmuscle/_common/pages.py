@@ -26,8 +26,10 @@ STYLE = """
 *{box-sizing:border-box}
 body{margin:0 auto;max-width:62rem;padding:1rem;font:16px/1.5 system-ui,sans-serif;color:var(--ink);background:var(--page)}
 h1{font-size:1.5rem;line-height:1.25;overflow-wrap:anywhere}h2{font-size:1.2rem;margin-top:2.2rem}a{color:var(--link)}
-figure{margin:1rem 0}figcaption{font-size:.9rem;color:var(--soft)}
-img{max-width:100%;height:auto;display:block;background:#fff;border-radius:4px}
+figure{margin:1.2rem 0}figcaption{font-size:.9rem;color:var(--soft);margin-top:.5rem}
+img{max-width:100%;height:auto;display:block;background:#fff;border:1px solid var(--line);border-radius:8px;padding:.6rem}
+@media screen and (prefers-color-scheme:dark){img{filter:invert(.914) hue-rotate(180deg);border-color:#ccc}}
+details{margin:1rem 0}summary{cursor:pointer;color:var(--link)}
 table{border-collapse:collapse;width:100%;font-size:.9rem}th,td{text-align:left;vertical-align:top;padding:.4rem .6rem;
 border-bottom:1px solid var(--line)}thead th{border-bottom:2px solid var(--strong)}
 p,li{overflow-wrap:anywhere}.scroll{overflow-x:auto}
@@ -35,11 +37,12 @@ pre,code{font-family:ui-monospace,monospace;font-size:.85rem}
 pre{white-space:pre-wrap;overflow-wrap:anywhere;background:var(--box);padding:.6rem .8rem;border-radius:4px}
 .verdict{font-weight:600}.yes{color:var(--yes)}.grid{color:var(--link)}.no{color:var(--no)}.open{color:var(--soft)}
 @media screen and (max-width:46rem){table.stack thead{position:absolute;left:-999rem}table.stack tr{display:block;
-padding:.5rem 0;border-bottom:2px solid var(--line)}table.stack td{display:block;border:0;padding:.1rem 0;
+padding:.4rem 0;border-bottom:1px solid var(--line)}table.stack td{display:inline-block;border:0;padding:0 .9rem 0 0;
 overflow-wrap:anywhere}
 table.stack td:empty{display:none}table.stack td::before{content:attr(data-label) ": ";font-size:.8rem;
-color:var(--soft)}table.stack td:first-child{font-weight:600}table.stack td:first-child::before{display:none}}
-@media print{body{max-width:none;padding:0;font-size:10pt}h2{break-after:avoid}tr,figure,pre{break-inside:avoid}
+color:var(--soft)}table.stack td:first-child{display:block;font-weight:600}
+table.stack td:first-child::before{display:none}}
+@media print{details::details-content{content-visibility:visible;display:block}summary{display:none}body{max-width:none;padding:0;font-size:10pt}h2{break-after:avoid}tr,figure,pre{break-inside:avoid}
 figure img{max-height:22cm;width:auto}a{color:inherit}@page{margin:16mm}}
 """.strip()  # noqa: E501 (rules of one selector stand on one line)
 
@@ -72,6 +75,11 @@ def paragraph(text: str, kind: str = "") -> Html:
     return Html(
         f"<p class='{escape(kind)}'>{escape(text)}</p>" if kind else f"<p>{escape(text)}</p>"
     )
+
+
+def folded(summary: str, *body: Html) -> Html:
+    """What is read on demand, behind a line that says what it is; paper shows all of it."""
+    return Html(f"<details><summary>{escape(summary)}</summary>{''.join(body)}</details>")
 
 
 def items(texts: Iterable[str]) -> Html:
@@ -127,10 +135,10 @@ def _in_words(value: Any) -> str:
             return f"{value:.6g}"
         case Mapping():
             return (
-                ", ".join(f"{name} = {_in_words(each)}" for name, each in value.items()) or "none"
+                "; ".join(f"{name} = {_in_words(each)}" for name, each in value.items()) or "none"
             )
         case list() | tuple():
-            return ", ".join(map(_in_words, value)) or "none"
+            return "; ".join(map(_in_words, value)) or "none"
     return str(value)
 
 

@@ -5,9 +5,6 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
-
 import jaxmuscle as jm
 from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.names import file_names
@@ -22,7 +19,7 @@ from .console import (
     csv_text,
     fit_files,
     out,
-    plain,
+    plain_lines,
     record,
     say_failure,
     say_notice,
@@ -37,14 +34,6 @@ if TYPE_CHECKING:
 
 
 FILES = ("cohort.csv", "differences.csv", "cohort.png", "cohort.pdf", "cohort.svg", REPORT)
-SHOWN = {
-    "harmonic_frequency": "harmonic (Hz)",
-    "corner_frequency": "corner (Hz)",
-    "harmonic_share": "harmonic\nshare",
-}
-CHI2 = (
-    "chi² per bin: squared distance of spectrum and fit in standard deviations, mean over the bins"
-)
 
 
 def fit_together(
@@ -144,10 +133,10 @@ def _write(
         write_text(folder / "differences.csv", csv_text(_columns(differences)))
     if any(row["stderr"] is not None for row in cohort.table()):
         figure = jm.plot.groups(cohort) if len(set(cohort.groups.values())) > 1 else cohort.plot()
-        cohort_report(cohort, figure, folder, places)
+        cohort_report(cohort, figure, folder)
         write_figure(figure, folder, "cohort", formats)
     else:
-        cohort_report(cohort, None, folder, places)
+        cohort_report(cohort, None, folder)
     fits = {name: str(places[name] / "fit.json") for name in cohort.results}
     record(
         {
@@ -175,43 +164,10 @@ def _columns(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
 
 
 def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None:
-    title = f"{len(cohort.results)} targets; numbers in brackets are not determined by the data"
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0)
-    table.add_column("target", overflow="fold")
-    grouped = bool(cohort.groups)
-    for column in [*["group"] * grouped, *SHOWN.values(), "chi²\nper\nbin"]:
-        table.add_column(
-            column, justify="left" if column == "group" else "right", no_wrap=column != "group"
-        )
-    for name, result in cohort.results.items():
-        cells = [plain(cohort.groups.get(name, ""))] * grouped + [
-            _cell(result.derived.get(q)) for q in SHOWN
-        ]
-        chi2 = "" if result.chi2_per_bin is None else f"{result.chi2_per_bin:.2f}"
-        chi2 = f"[bold red]{chi2}*[/]" if result.adequate is False else chi2
-        table.add_row(plain(name), *cells, chi2 if result.success else "[bold red]failed[/]")
-    out.print(table)
-    out.print(f"{CHI2}. * the model does not describe the data")
-    out.print(plain(cohort.verdict))
-    for d in cohort.differences():
-        unit = "" if d.unit == "1" else f" {d.unit}"
-        out.print(
-            f"{plain(d.quantity)}: {plain(d.b)} - {plain(d.a)} = {d.difference:.3g}{unit} "
-            f"(95 %: {d.low:.3g} to {d.high:.3g})",
-        )
+    out.print(plain_lines(cohort), soft_wrap=True)
     for name, why in cohort.failed.items():
         say_failure(f"{name}: {why}", "not fitted")
     for name in cohort.results:
         if places[name].name != name:
             say_notice(f"{name}: cannot be the name of a folder here; its fit is in {places[name]}")
-    say_written(folder, "cohort.csv", f"{REPORT} and a folder for each target")
-
-
-def _cell(estimate: Any) -> str:
-    if estimate is None:
-        return ""
-    return (
-        f"({estimate.value:.3g})"
-        if estimate.stderr is None
-        else f"{estimate.value:.3g}±{estimate.stderr:.1g}"
-    )
+    say_written(folder, REPORT, "cohort.csv and a folder for each target")

@@ -11,11 +11,12 @@ from .cluster import Scheduler, Workers, workers_of
 from .console import (
     CONVERGED,
     NOT_CONVERGED,
+    out,
+    plain_lines,
     record,
     reporting,
     say_notice,
     say_written,
-    show,
     writable,
 )
 from .options import (
@@ -133,20 +134,16 @@ def study(
 
 def write_study(found: "StudyResult", output: Path, formats: list[str]) -> None:
     """Say what is to be noticed of its recordings, write it, and print it."""
-    from jaxmuscle.reports import study_report
+    from jaxmuscle.reports import REPORT, study_notices, study_report
 
-    whose: dict[str, list[str]] = {}
-    for cell in found.cells:
-        for notice in cell.target.notices:
-            whose.setdefault(notice, []).append(cell.target.name)
-    for notice, names in whose.items():
-        said = "all" if len(names) == len(found.cells) else "; ".join(names)
-        say_notice(f"{said}: {notice}")
+    for notice in study_notices(found):
+        say_notice(notice)
     found.save(output, formats)
     study_report(found, output)
     record(output / "study.json")
-    show(found, success=found.success)
-    say_written(output, *sorted(path.name for path in output.iterdir()))
+    out.print(plain_lines(found), soft_wrap=True)
+    files = {path.name for path in output.iterdir()} - {REPORT}
+    say_written(output, REPORT, *sorted(files))
 
 
 def measured_study(

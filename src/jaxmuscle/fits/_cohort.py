@@ -86,6 +86,7 @@ class CohortResult(Result, eqx.Module):
         """
         rows = []
         for name, result in self.results.items():
+            judged = result.adequacy
             for quantity, e in _quantities(result).items():
                 low, high = (None, None) if e.interval is None else e.interval
                 rows.append(
@@ -101,7 +102,8 @@ class CohortResult(Result, eqx.Module):
                         "unit": e.unit,
                         "determined": e.stderr is not None,
                         "mvc_fraction": result.target.mvc_fraction,
-                        "chi2_per_bin": result.chi2_per_bin,
+                        "chi2_per_bin": None if judged is None else judged.chi2 / result.data,
+                        "chi2_expected": None if judged is None else judged.expected / result.data,
                         "adequate": result.adequate,
                         "adequacy_p": result.adequacy_p,
                         "success": result.success,

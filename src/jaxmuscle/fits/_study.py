@@ -130,9 +130,22 @@ class StudyResult(Result, eqx.Module):
         for cell in self.cells:
             result = self.cohort.results.get(cell.target.name)
             measured = {n: m for n, m in cell.target.measured.items() if math.isfinite(m.value)}
-            of_model = {} if result is None or result.adequate is False else result.determined
+            of_model = {}
+            if result is not None and result.adequate is not False:
+                of_model = result.as_shown(result.determined)
             found[cell.person, cell.condition] = measured | of_model
         return found
+
+    def missing(self) -> dict[str, int]:
+        """Of how many people and conditions a compared quantity is not known: they show no tremor,
+        or the data do not determine it, or the model does not describe them. Only quantities that
+        miss some."""
+        known = self._known()
+        counts = {
+            name: sum(name not in table for table in known.values())
+            for name in self._compared_names(known)
+        }
+        return {name: count for name, count in counts.items() if count}
 
     def table_1(self) -> list[dict[str, Any]]:
         """Mean and standard deviation over people of every measured quantity (but the p-value of
@@ -398,7 +411,7 @@ def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
         "adequate": result.adequate,
         "adequacy_p": result.adequacy_p,
         "fitted": result.fitted,
-        "estimates": {name: vars(p) for name, p in result.found.items()},
+        "estimates": {name: vars(p) for name, p in result.as_shown(result.found).items()},
     }
 
 

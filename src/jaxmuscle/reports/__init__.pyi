@@ -12,3 +12,4 @@ from ._pages import fit_report as fit_report
 from ._pages import posterior_report as posterior_report
 from ._pages import study_report as study_report
 from ._study_text import study_card as study_card
+from ._study_text import study_notices as study_notices

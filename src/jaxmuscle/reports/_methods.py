@@ -2,7 +2,6 @@
 trials of one person."""
 
 import platform
-import re
 from collections import Counter
 from typing import TYPE_CHECKING
 
@@ -10,104 +9,157 @@ import scipy
 
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.text import probability
-from jaxmuscle.data._measured import is_recorded, tremor_band
+from jaxmuscle.data._measured import LEVEL, is_recorded, tremor_band
+from jaxmuscle.data._recording import UNRAMPED
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from ._study_text import counted, people_in_words, range_of, trials_in_words
+from ._study_text import (
+    counted,
+    found_windows,
+    lengths_of_study,
+    people_in_words,
+    range_of,
+    windows_of,
+)
 
 if TYPE_CHECKING:
     from jaxmuscle.data._target import Target
     from jaxmuscle.fits._result import FitResult
     from jaxmuscle.fits._study import StudyResult
 
-NAMES = {
-    "holm": "Holm's method, which bounds the chance of any false positive",
+CORRECTIONS = {
+    "holm": "by Holm's method (Holm 1979, Scand J Stat 6:65-70)",
     "fdr": (
-        "the method of Benjamini and Hochberg, which bounds the expected share of false positives"
+        "by the method of Benjamini and Hochberg for the false discovery rate (1995, J R Stat Soc B"
+        " 57:289-300)"
     ),
 }
 DETREND = {
-    "constant": "mean removed",
-    "linear": "straight line removed",
-    "none": "mean not removed",
+    "constant": "mean of each segment removed",
+    "linear": "straight line of each segment removed",
+    "none": "no detrending",
 }
 TESTS = {
-    "groups": "groups within each condition by Welch's t test",
+    "groups": "groups within each condition by Welch's t test for unequal variances",
     "conditions": "conditions within people by the paired t test",
-    "interaction": "the change between conditions of two groups by Welch's t test",
+    "interaction": "the change between conditions of two groups (interaction) by Welch's t test",
 }
-WINDOWED = re.compile(r"([\d.]+) Hz, window ([\d.]+) s to ([\d.]+) s")  # in the source of a target
+MODEL = (
+    "stochastic rheological muscle model (Zagrodny, Wojnicz, Ludwicki and Barański, Enhancing"
+    " rheological muscle models with stochastic processes)"
+)
 
 
 def study_methods(study: "StudyResult") -> str:
-    """People, recordings, spectra, model, fit, statistics and versions, in sentences."""
-    s = study.cells[0].target.settings
-    window = study.options["reading"].get("window")
-    judged = [
-        result.adequate for result in study.cohort.results.values() if result.adequate is not None
-    ]
+    """People, recordings, spectra, model, fit, statistics and versions, as the methods section of a
+    paper says them."""
+    target = study.cells[0].target
     rates = [rate for cell in study.cells for rate in cell.rates]
-    named = {None: "the steady part of each recording", "all": "each recording as a whole"}
-    part = (
-        f"{window[0]:g} s to {window[1]:g} s" if isinstance(window, tuple | list) else named[window]
-    )
+    trials = [cell.trials for cell in study.cells]
+    segments = [sum(cell.target.segments or ()) for cell in study.cells]
     whose = "person and condition" if any(study.conditions) else "person"
     used = versions() if study.aic else {n: versions()[n] for n in ("jaxmuscle", "numpy")}
+    unit = f" ({target.unit})" if target.unit else ""
     said = [
-        f"We analysed {people_in_words(study)}: {trials_in_words(study)}.",
         (
-            f"Recordings of {study.cells[0].target.quantity} (sampled at {range_of(rates)} Hz) were"
-            f" resampled to {s.rate:g} Hz and"
-            f" {_low_pass(s)}; {part} was analysed unless another window was specified."
+            f"We recorded the {target.quantity}{unit} of {people_in_words(study)}:"
+            f" {counted(sum(trials), 'recording')}, {range_of(trials)} per {whose}, sampled at"
+            f" {range_of(rates)} Hz."
         ),
-        _welch(s),
-        (
-            f"Spectra of trials of one {whose} were averaged, weighted by their number of Welch"
-            " segments; of what else was measured the trials' values were averaged."
+        _parts(study, sum(trials)),
+        *_subtracted(study),
+        _prepared(target.settings),
+        _measured(target, several=max(trials) > 1),
+        f"{_welch(target.settings)}, with {range_of(segments)} segments per {whose}.",
+        *(
+            ["Spectra of the trials were averaged, weighted by their number of segments."]
+            * (max(trials) > 1)
         ),
-        _measured(study.cells[0].target),
-        *(_model(study, judged) if study.aic else []),
+        _tremor(target),
+        *(_model(study) if study.aic else []),
         *_statistics(study),
         f"{_software(used)}, scipy {scipy.__version__}, Python {platform.python_version()}.",
     ]
     return " ".join(said)
 
 
-def _model(study: "StudyResult", judged: list[bool]) -> list[str]:
+def _parts(study: "StudyResult", number: int) -> str:
+    """How the analysed part of every recording was chosen, how long it is."""
+    found, lengths = found_windows(study), lengths_of_study(study)
+    long = f" These parts were {range_of(lengths)} s long." if lengths else ""
+    if not found:
+        named = study.options["reading"].get("window")
+        notices = [notice for cell in study.cells for notice in cell.target.notices]
+        if isinstance(named, tuple | list):
+            return f"Recordings were analysed from {named[0]:g} s to {named[1]:g} s."
+        if lengths and not any(UNRAMPED in notice for notice in notices):
+            return f"Recordings were analysed in parts that were specified.{long}"
+        return f"Recordings were analysed as a whole.{long.replace('These parts', 'They')}"
+    some = f"In {found} of {number} recordings the" if found < number else "The"
+    others = "; in the others the part was specified, or all was analysed" * (found < number)
+    return (
+        f"{some} plateau was found automatically: the longest stretch in which the running median"
+        " over 1 s stayed within 10 % of the contraction level, without one second beside each"
+        f" ramp{others}.{long}"
+    )
+
+
+def _subtracted(study: "StudyResult") -> list[str]:
+    """What was subtracted from recordings, as their notices say."""
+    notices = [notice for cell in study.cells for notice in cell.target.notices]
+    said = []
+    if any(
+        "This was subtracted" in notice or "subtracted as asked" in notice for notice in notices
+    ):
+        said.append("The level of the sensor at rest was subtracted where it was not zero.")
+    if any("the straight line through" in notice for notice in notices):
+        said.append("The straight line through the analysed part was subtracted.")
+    return said
+
+
+def _model(study: "StudyResult") -> list[str]:
     """The model of all people, and how many it describes."""
+    judged = [r.adequate for r in study.cohort.results.values() if r.adequate is not None]
     noise = "" if study.options["noise"] is None else f" with {study.options['noise']} noise"
     known = study.cells[0].target.mean_force is not None
-    further = " and its coefficient of variation"
-    if known:
-        further = ", its coefficient of variation and its mean force"
+    further = ", its coefficient of variation and its mean force" * known
+    others = "; the model's quantities of the others were left out" * (not all(judged))
     return [
         (
-            f"A stochastic rheological muscle model{noise} was fitted to every averaged spectrum"
-            f"{further} (linear response, Levenberg-Marquardt, {study.options['starts']} starts,"
-            " log power weighted by the scatter of Welch's estimate)."
+            f"A {MODEL}{noise} was fitted to the averaged spectrum of each person in each"
+            f" condition{further or ' and its coefficient of variation'} (linear response,"
+            f" Levenberg-Marquardt, {study.options['starts']} starts, log power weighted by the"
+            " scatter of Welch's estimate)."
         ),
         f"All spectra were fitted with the same model ({RUNGS[study.rung]}){_choice(study)}.",
         (
-            f"The model describes {sum(judged)} of {len(judged)} spectra (p >= 0.01); the model's"
-            " numbers of the others were left out."
+            f"It described {sum(judged)} of {len(judged)} spectra (p >= 0.01 in a test of goodness"
+            f" of fit by simulated replicates){others}."
         ),
     ]
 
 
-def _measured(target: "Target") -> str:
-    """How what needs no model was measured."""
-    low, high = tremor_band(target.quantity)
-    power = "the discrete cosine transform (DCT-II) of the whole part, over the squared mean"
+def _measured(target: "Target", *, several: bool) -> str:
+    """How what needs no model and no Welch spectrum was measured."""
+    averaged = " Values of the trials were averaged." if several else ""
     return (
-        "Mean, standard deviation and coefficient of variation (about the mean, and about a"
-        f" straight line) are those of the filtered signal. Power by band is from {power}; the"
-        " median frequency halves the power of the Welch spectrum; sample entropy has templates of"
-        f" 2 samples and a tolerance of 0.2 standard deviations. A tremor from {low:g} to {high:g}"
-        " Hz was stated where the averaged Welch spectrum had a peak that at most 1 % of simulated"
-        " smooth spectra show; its frequency is the centre of the power above the smooth spectrum,"
-        " its size the root of that power over the mean."
+        "From the filtered signal we computed mean, standard deviation (SD) and coefficient of"
+        " variation (CV = SD / mean; also after a straight line was removed); power by band, from"
+        " the discrete cosine transform (DCT-II), over the squared mean; and sample entropy (m ="
+        f" 2, r = 0.2 SD; Richman and Moorman 2000, Am J Physiol 278:H2039-H2049).{averaged}"
+    )
+
+
+def _tremor(target: "Target") -> str:
+    """What was measured of the Welch spectrum."""
+    low, high = tremor_band(target.quantity)
+    return (
+        "The median frequency halves the power of this spectrum. A tremor was stated where the"
+        f" spectrum had a peak from {low:g} to {high:g} Hz that at most {100 * LEVEL:g} % of"
+        " simulated smooth spectra show; its frequency is the centre of the power above the smooth"
+        " spectrum, its size the root of that power over the mean."
     )
 
 
@@ -132,13 +184,15 @@ def fit_methods(result: "FitResult") -> str | None:
         else ""
     )
     checked = f" and checked by {set_to['check_seeds']} new ones" * bool(set_to.get("check_seeds"))
+    recorded = is_recorded(target.measured)
     how = "in linear response" if result.method == "linear" else "by simulation (Monte Carlo)"
     said = [
         _data(result),
-        _welch(target.settings),
-        *([_measured(target)] if is_recorded(target.measured) else []),
+        *([_measured(target, several=len(target.segments or ()) > 1)] if recorded else []),
+        f"{_welch(target.settings)}.",
+        *([_tremor(target)] if recorded else []),
         (
-            f"A stochastic rheological muscle model ({result.only.model}) was fitted to"
+            f"A {MODEL}, {result.only.model}, was fitted to"
             f" {' and '.join(fitted.rsplit(', ', 1))} {how} (Levenberg-Marquardt,"
             f" {set_to['starts']} starts, log power weighted by its scatter, seed"
             f" {result.seed}{simulated}{checked if simulated else ''})."
@@ -154,7 +208,7 @@ def fit_methods(result: "FitResult") -> str | None:
 def _data(result: "FitResult") -> str:
     target, s = result.target, result.target.settings
     segments = "" if target.segments is None else f" ({sum(target.segments)} Welch segments)"
-    read = [tuple(map(float, found)) for found in WINDOWED.findall(target.source)]
+    read = windows_of(target)
     if not read:
         return f"We analysed the {target.quantity} spectrum {target.name}{segments}."
     lengths = [round(stop - start, 1) for _, start, stop in read]
@@ -173,8 +227,7 @@ def _data(result: "FitResult") -> str:
     return (
         f"We analysed {counted(len(read), 'recording')} of {target.quantity}{segments}, sampled at"
         f" {range_of([rate for rate, *_ in read])} Hz: a part of {range_of(lengths)}"
-        f" s{' of each' * several}, after the recording had been resampled to {s.rate:g} Hz and"
-        f" {_low_pass(s)}.{averaged}"
+        f" s{' of each' * several}. {_prepared(s)}{averaged}"
     )
 
 
@@ -223,23 +276,27 @@ def _assumed(result: "FitResult") -> list[str]:
 
 def _welch(s: SpectrumSettings) -> str:
     return (
-        f"Power spectra were estimated by Welch's method ({_window(s)}, {s.length} samples,"
+        "Power spectra were estimated by Welch's method (Welch 1967, IEEE Trans Audio Electroacoust"
+        f" 15:70-73; {_window(s)}, {s.length} samples or {s.length / s.rate:.3g} s,"
         f" {100 * s.overlap:g} % overlap, {DETREND[s.detrend]}) from {s.frequency[0]:.2f} to"
-        f" {s.frequency[-1]:.2f} Hz."
+        f" {s.frequency[-1]:.2f} Hz"
     )
 
 
-def _low_pass(s: SpectrumSettings) -> str:
+def _prepared(s: SpectrumSettings) -> str:
     if s.filter_cutoff is None:
-        return "not low-pass filtered"
+        return f"Signals were resampled to {s.rate:g} Hz and not low-pass filtered."
     ways = "forwards and backwards" if s.filter_direction == "both" else "forwards"
     return (
-        f"low-pass filtered (Butterworth, order {s.filter_order}, {s.filter_cutoff:g} Hz, {ways})"
+        f"Signals were resampled to {s.rate:g} Hz and low-pass filtered (Butterworth, order"
+        f" {s.filter_order}, {s.filter_cutoff:g} Hz, {ways})."
     )
 
 
 def _software(numbers: dict[str, str]) -> str:
-    return f"Software: {', '.join(f'{name} {number}' for name, number in numbers.items())}"
+    used = [f"{name} {number}" for name, number in numbers.items() if name != "jaxmuscle"]
+    own = f"jaxmuscle {numbers['jaxmuscle']} (The jaxmuscle developers; see its CITATION.cff)"
+    return f"Software: {', '.join([own, *used])}"
 
 
 def _window(s: SpectrumSettings) -> str:
@@ -261,29 +318,25 @@ def _statistics(study: "StudyResult") -> list[str]:
         return []
     families = Counter(d.kind for d in found)
     tests = "; ".join(f"{TESTS[kind]} ({counted(n, 'comparison')})" for kind, n in families.items())
-    correction = NAMES.get(study.options["correction"])
-    p = (
-        f"p-values were corrected by {correction}, for all comparisons of the same kind together"
-        + " (those of the model's numbers apart from those of measured ones)" * bool(study.aic)
-        if correction
-        else "p-values are not corrected for the number of comparisons"
-    )
-    left = [d.left_out for d in found if d.left_out]
-    selected = (
-        [
-            "A quantity that is not known of a person (no tremor, not determined by the fit, or a"
-            f" model that does not describe the spectrum) was left out for that person (in"
-            f" {len(left)} of {len(found)} comparisons, {range_of(left)} people), which is a"
-            " selection."
-        ]
-        if left
-        else []
-    )
+    correction = CORRECTIONS.get(study.options["correction"])
+    apart = ", those of the model's quantities apart from those of measured ones"
+    p = "p values are not corrected for the number of comparisons"
+    if correction:
+        p = f"p values were corrected {correction}, each of these kinds of comparison by itself"
+        p += apart * bool(study.aic)
+    alpha = study.options["alpha"]
+    selected = []
+    if left := [d.left_out for d in found if d.left_out]:
+        selected.append(
+            "Values that do not exist (no tremor, or a quantity that the fit does not determine)"
+            f" were left out: in {len(left)} of {len(found)} comparisons, of at most"
+            f" {counted(max(left), 'person', 'people')}."
+        )
     return [
         (
-            f"We compared {tests}. In a comparison each person counted once; quantities were not"
-            f" log-transformed. Each {100 * (1 - study.options['alpha']):g} % interval is for a"
-            f" single comparison; {p}."
+            f"We compared {tests}. The unit of analysis was the person. Quantities were not"
+            f" log-transformed. The level of significance was {alpha:g}; {p}. Intervals"
+            f" ({100 * (1 - alpha):g} %) are not corrected."
         ),
         *selected,
     ]

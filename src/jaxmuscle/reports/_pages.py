@@ -11,8 +11,24 @@ from jaxmuscle._common import pages
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.pages import Html
 
+from ._cohort_text import judged_in_words
 from ._ladder_text import format_p
-from ._study_text import difference_in_words, people_in_words, table_1, trials_in_words
+from ._study_text import (
+    GLOSS,
+    WORDS,
+    clear_in_words,
+    clearest_first,
+    compared_in_words,
+    difference_in_words,
+    is_clear,
+    missing_in_words,
+    n_in_words,
+    p_in_words,
+    people_in_words,
+    people_of_columns,
+    table_1,
+    trials_in_words,
+)
 
 if TYPE_CHECKING:
     from jaxmuscle.fits._cohort import CohortResult
@@ -27,6 +43,15 @@ SPELT_OUT = {"carried": "multiplied, to come to the mean force"}
 OF_MODEL = ("rung", "noise", "starts", "key")  # options of a study
 STATE = 4  # the column of a fit's card that says whether the data determine a number
 PARAMETERS = ("name", "value", "95 % interval", "unit", "what it is")
+COMPARED = (
+    "quantity",
+    "groups",
+    "difference of means",
+    "95 % interval",
+    "unit",
+    "n",
+    "left out",
+)
 FIGURES = {
     "fit": (
         "Points: the data, with the range of one standard deviation. Blue line: fit. Bars:"
@@ -82,7 +107,8 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
     held = result.adequate is not False
     body = [
         _verdict(card.heading, good=False if not result.success else result.adequate),
-        *_table("What is measured", PARAMETERS[:STATE], [row[:STATE] for row in rows["measured"]]),
+        pages.picture(figure, FIGURES["fit" if _has_spectrum(result) else "stiffness"]),
+        *_measured([row[:STATE] for row in rows["measured"]]),
         *_table(
             "What the data determine" if held else WOULD,
             PARAMETERS,
@@ -90,7 +116,6 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
             otherwise="Nothing.",
         ),
         *_tried(result),
-        pages.picture(figure, FIGURES["fit" if _has_spectrum(result) else "stiffness"]),
         *_list("What to know about this fit", card.remarks),
     ]
     if result.undetermined:
@@ -102,14 +127,28 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
             PARAMETERS,
             rows["not determined"],
             said="Do not interpret these values.",
+            summary=f"{len(rows['not determined'])} values",
         ),
-        *_table("What was fixed", PARAMETERS, rows["fixed"]),
+        *_table(
+            "What was fixed", PARAMETERS, rows["fixed"], summary=f"{len(rows['fixed'])} values"
+        ),
     ]
     if methods := result.methods():
         body += [pages.heading("For your methods section"), pages.paragraph(methods)]
     body += _data(result.targets)
     body += _how(result.settings | {"method": result.method, "seed": result.seed}, result.versions)
     pages.write_page(folder / REPORT, result.title, body)
+
+
+def _measured(rows: list[tuple[str, ...]]) -> list[Html]:
+    """What papers state; what else is measured, folded."""
+    columns = PARAMETERS[:STATE]
+    stated = [row for row in rows if row[0] in WORDS]
+    others = [row for row in rows if row[0] not in WORDS]
+    body = _table("What is measured", columns, stated or others)
+    if stated and others:
+        body.append(pages.folded(f"{len(others)} more numbers", pages.table(columns, others)))
+    return body
 
 
 def _tried(result: "FitResult") -> list[Html]:
@@ -133,9 +172,7 @@ def _tried(result: "FitResult") -> list[Html]:
     )
 
 
-def cohort_report(
-    cohort: "CohortResult", figure: Any | None, folder: Path, places: dict[str, Path]
-) -> None:
+def cohort_report(cohort: "CohortResult", figure: Any | None, folder: Path) -> None:
     """Write report.html of a cohort."""
     numbers = [
         (
@@ -150,12 +187,9 @@ def cohort_report(
     ]
     card = cohort.summary()
     body = [
-        _verdict(
-            cohort.verdict,
-            good=cohort.success and not any(r.adequate is False for r in cohort.results.values()),
-        ),
-        pages.table(card.columns, card.rows),
+        _judged(cohort),
         *([pages.picture(figure, FIGURES["cohort"])] if figure is not None else []),
+        pages.table(card.columns, card.rows),
     ]
     differences = [
         (
@@ -164,21 +198,25 @@ def cohort_report(
             f"{d.difference:.3g}",
             f"{d.low:.3g} to {d.high:.3g}",
             _unit(d.unit),
+            n_in_words(d),
+            str(d.left_out),
         )
         for d in cohort.differences()
     ]
-    fits = ", ".join(f"`{place / 'fit.json'}`" for place in places.values())
     body += [
         *_table(
             "What differs between groups",
-            ("quantity", "groups", "difference of means", "95 % interval", "unit"),
+            COMPARED,
             differences,
+            said="The intervals are not corrected for the number of comparisons.",
+            summary=f"{len(differences)} comparisons",
         ),
         *_table(
             "What the data determine",
             ("target", "group", "quantity", "value", "unit"),
             numbers,
             otherwise="Nothing.",
+            summary=f"{len(numbers)} numbers",
         ),
         *_list(
             "What to do next",
@@ -186,13 +224,22 @@ def cohort_report(
                 "Fit a target alone for the checks that a cohort leaves out: `jaxmuscle fit"
                 " TARGET`.",
                 "Do not interpret the numbers of a target that the model does not describe.",
-                f"All numbers are in cohort.csv; each fit is in {fits}.",
+                "All numbers are in cohort.csv; each fit is in the folder of its target.",
             ),
         ),
     ]
     first = next(iter(cohort.results.values()))
     body += _how(first.settings | {"method": first.method, "seed": first.seed}, first.versions)
     pages.write_page(folder / REPORT, f"{len(cohort.results)} targets", body)
+
+
+# what a table of each kind of comparison is called, and what `where` is in it
+KINDS = {
+    "groups": ("Groups, in each condition", "condition"),
+    "conditions": ("Conditions, within people", ""),
+    "interaction": ("Change between conditions, of groups", "change"),
+}
+SIZES = ("difference", "interval", "p", "p corrected", "n", "left out")
 
 
 def study_report(study: "StudyResult", folder: Path) -> None:
@@ -203,49 +250,91 @@ def study_report(study: "StudyResult", folder: Path) -> None:
     pictures = [pages.picture(figure, FIGURES[name]) for name, figure in figures.items()]
     for figure in figures.values():
         plt.close(figure)
-    found = sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))
-    rows = [
-        (
-            *difference_in_words(d),
-            f"{d.p:.2g}",
-            "" if d.p_corrected is None else f"{d.p_corrected:.2g}",
-            " and ".join(map(str, d.members if d.kind != "conditions" else d.members[:1])),
-            str(d.left_out or ""),
-        )
-        for d in found
-    ]
-    columns = ("comparison", "difference and interval", "p", "p corrected", "people", "left out")
     heads, lines = table_1(study)
-    fits = [(name, result.verdict) for name, result in study.cohort.results.items()]
-    fits += [(name, f"not fitted: {why}") for name, why in study.cohort.failed.items()]
+    heads = [f"{head} (n = {n})" for head, n in zip(heads, people_of_columns(study), strict=True)]
+    missing = missing_in_words(study)
+    options = {n: v for n, v in study.options.items() if study.aic or n not in OF_MODEL}
     body = [
         pages.items((people_in_words(study), trials_in_words(study))),
+        *([_judged(study.cohort)] if study.aic else []),
+        *pictures,
         *_table(
             "Table 1: mean ± SD of people",
             ("", *heads),
             [(words, *cells) for words, cells in lines],
+            said=f"{GLOSS}. In brackets: n, where it is less than that of the column.",
         ),
-        *pictures,
-        *_table("What differs", columns, rows, otherwise="Nothing could be compared."),
-    ]
-    if study.aic:
-        verdict = _verdict(study.cohort.verdict, good=study.success)
-        table = pages.table(("person and condition", "in words"), fits)
-        body += [pages.heading("The fits"), verdict, table]
-    options = {n: v for n, v in study.options.items() if study.aic or n not in OF_MODEL}
-    body += [
+        *_differences(study),
+        *([pages.heading("What is not known"), pages.paragraph(missing)] if missing else []),
+        *(_fits(study.cohort) if study.aic else []),
         pages.heading("For your methods section"),
         pages.paragraph(study.methods()),
         *_list(
             "What to do next",
             (
-                "Report p corrected, and how many people were left out of each comparison.",
+                "Report p corrected, n and how many people were left out of each comparison.",
                 "All numbers are in table1.csv, people.csv and differences.csv.",
             ),
         ),
         *_how(options | {"source": study.source}, versions()),
     ]
     pages.write_page(folder / REPORT, "Study", body)
+
+
+def _differences(study: "StudyResult") -> list[Html]:
+    """A table of each kind of comparison, the clearest first; those that are not clear folded."""
+    found, alpha = clearest_first(study), study.options["alpha"]
+    if not found:
+        return [pages.heading("What differs"), pages.paragraph("Nothing could be compared.")]
+    body = [
+        pages.heading("What differs"),
+        pages.paragraph(
+            f"{clear_in_words(found, study)}. The {100 * (1 - alpha):g} % intervals are of single"
+            " comparisons. n: people."
+        ),
+    ]
+    for kind, (title, where) in KINDS.items():
+        columns = ("quantity", where, "compared", *SIZES)
+        rows = {True: [], False: []}
+        for d in found:
+            if d.kind == kind:
+                rows[is_clear(d, alpha)].append(
+                    (
+                        *compared_in_words(d),
+                        *difference_in_words(d),
+                        p_in_words(d.p),
+                        p_in_words(d.p_corrected),
+                        n_in_words(d),
+                        str(d.left_out),
+                    )
+                )
+        if any(rows.values()):
+            body.append(pages.heading(title, 3))
+        if rows[True]:
+            body.append(pages.table(columns, rows[True]))
+        if rows[False]:
+            said = f"{len(rows[False])} with p >= {alpha:g}"
+            body.append(pages.folded(said, pages.table(columns, rows[False])))
+    return body
+
+
+def _fits(cohort: "CohortResult") -> list[Html]:
+    """What the verdict on each fit is, those that are not described first."""
+    rows = [(name, *judged_in_words(result)) for name, result in cohort.results.items()]
+    rows += [(name, "", "", "", f"not fitted: {why}") for name, why in cohort.failed.items()]
+    rows.sort(key=lambda row: row[-1] == "described")
+    columns = ("person and condition", "chi2 per bin", "expected", "p", "by the model")
+    return [
+        pages.heading("The fits"),
+        pages.folded(f"{len(rows)} fits", pages.table(columns, rows)),
+    ]
+
+
+def _judged(cohort: "CohortResult") -> Html:
+    """The verdict on all fits, in the colour of the worst of them."""
+    judged = [result.adequate for result in cohort.results.values()]
+    good = cohort.success and False not in judged
+    return _verdict(cohort.verdict, good=None if good and None in judged else good)
 
 
 def posterior_report(
@@ -297,12 +386,15 @@ def _table(
     *,
     said: str = "",
     otherwise: str = "",
+    summary: str = "",
 ) -> list[Html]:
-    """A section with a table; without rows what is said `otherwise`, or nothing at all."""
+    """A section with a table, folded behind its `summary` if it has one; without rows what is said
+    `otherwise`, or nothing at all."""
     if not rows:
         return [pages.heading(title), pages.paragraph(otherwise)] if otherwise else []
     before = [pages.paragraph(said)] if said else []
-    return [pages.heading(title), *before, pages.table(columns, rows)]
+    table = pages.table(columns, rows)
+    return [pages.heading(title), *before, pages.folded(summary, table) if summary else table]
 
 
 def _list(title: str, texts: Iterable[str]) -> list[Html]:
@@ -384,8 +476,11 @@ def _how(settings: dict[str, Any], versions: dict[str, str]) -> list[Html]:
     return [
         pages.heading("How to repeat this"),
         pages.code(shlex.join(["jaxmuscle", *sys.argv[1:]])),
-        pages.settings_table(
-            {SPELT_OUT.get(name, name): value for name, value in settings.items()}
+        pages.folded(
+            f"{len(settings)} settings",
+            pages.settings_table(
+                {SPELT_OUT.get(name, name): value for name, value in settings.items()}
+            ),
         ),
         pages.paragraph(
             "Versions: " + ", ".join(f"{name} {number}" for name, number in versions.items())
