@@ -333,7 +333,7 @@ def test_the_parts_of_a_model_add_up_to_the_fit():
     found = result(components=tremor(), task=on_rung(Isometric(), 2))
     figure = plot.fit(found)
     labels = [label for label in key(figure) if "%" in label]
-    assert [label.partition(",")[0] for label in labels] == ["slow part", "floor", "tremor"]
+    assert [label.partition(",")[0] for label in labels] == ["slow part", "floor", "resonance"]
     shares = [float(label.split(", ")[1].split()[0]) for label in labels]
     assert sum(shares) == pytest.approx(100, abs=1.5)  # two digits each
     spectrum, _ = panels(figure)
@@ -362,7 +362,7 @@ def test_the_frequencies_of_resonances_are_marked_in_the_colours_of_their_parts(
     figure = plot.fit(of_two_resonances(0.2))
     spectrum, _ = panels(figure)
     for label, where, color in (
-        ("tremor, 20 % (9.22 Hz)", 9.22, plot.GREEN),
+        ("resonance, 20 % (9.22 Hz)", 9.22, plot.GREEN),
         ("second resonance,", 3.7, plot.PURPLE),
     ):
         (words,) = (each for each in key(figure) if each.startswith(label))
@@ -382,7 +382,7 @@ def test_the_words_below_a_fit_of_two_resonances_find_room_in_its_width():
 
 @pytest.mark.parametrize(
     ("frequency", "share", "words"),
-    [(25.0, 0.2, ["tremor, 20 % (25 Hz)"]), (9.22, 1e-6, [])],
+    [(25.0, 0.2, ["resonance, 20 % (25 Hz)"]), (9.22, 1e-6, [])],
 )
 def test_a_tremor_outside_the_bins_or_without_power_is_not_marked_there(frequency, share, words):
     ax = panels(plot.fit(of_two_resonances(share, resonance_frequency=frequency)))[0]

@@ -35,7 +35,7 @@ PARTS = {
     "relaxation": (SKY, "-", "slow part"),
     "floor": (GREY, ":", "floor"),
     "harmonic": (ORANGE, "-", "regular rhythm"),
-    "resonance": (GREEN, "--", "tremor"),
+    "resonance": (GREEN, "--", "resonance"),
     "resonance_2": (PURPLE, "-.", "second resonance"),
 }
 LEAST = 1e-4  # share of the power below which a part is not drawn
