@@ -1142,7 +1142,7 @@ def test_steadiness_of_trials(tmp_path):
     result = run("steadiness", *files[:3], "--window", "0:8,1:8,0:8", "--out", tmp_path / "out")
     assert (
         result.exit_code == 0
-        and "Steadiness of 3 trials: force [N], 7 s to 8 s each" in result.stdout
+        and "3 trials of force (N), 7.0 s to 8.0 s each" in result.stdout
     )
     windows = ((0, 8), (1, 8), (0, 8))
     each = zip(files, windows, strict=False)

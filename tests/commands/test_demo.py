@@ -112,8 +112,8 @@ def test_pages_quote_what_is_printed(folder, study, monkeypatch):
     """Each line of an output in README and tutorials; their Python is run."""
     monkeypatch.chdir(folder.parent)
     steadiness = pages.run("docs/tutorial-steadiness.md")["found"]
-    measured = "Steadiness of 3 trials: force [N], 14.3 s"
-    table = "Table 1: mean ± SD of people; in brackets of how many, where some have no value"
+    measured = "sim01_tired   3 trials of force (N), 14.3 s each, found automatically"
+    table = "STUDY  6 people in 2 conditions (rest; tired)"
     for page, first, result in (
         ("README.md", measured, steadiness),
         ("docs/tutorial-steadiness.md", measured, steadiness),
@@ -123,9 +123,9 @@ def test_pages_quote_what_is_printed(folder, study, monkeypatch):
     pages.run("docs/tutorial-study.md")
     assert (folder / "mine.csv").read_text() == (folder / "study.csv").read_text()
     (folder / "mine.csv").unlink()
-    first = "Comparisons of what is measured: 8 of conditions; after correction (holm) 3 have"
+    first = next(line for line in str(study).splitlines() if line.startswith("DIFFERENCES"))
     of_both = quoted("docs/tutorial-study.md", first)
-    of_model = next(i for i, line in enumerate(of_both) if line.startswith("Model of all"))
+    of_model = next(i for i, line in enumerate(of_both) if line.startswith("MODEL"))
     assert set(of_both[:of_model]) <= set(str(study).splitlines())
     analysed = run("analyse", "demo/moved.csv", "--out", "moved").stdout.splitlines()
     wanted = quoted(

@@ -1,6 +1,7 @@
 """Measured numbers as lines of a table."""
 
 import math
+from collections.abc import Sequence
 
 from jaxmuscle._common.text import probability, squared
 
@@ -10,6 +11,8 @@ from ._measured import FAST, LEVEL_NAME, MEAN, MEDIAN, RANGES, RECORDED, VARIATI
 CUT_OFF = RECORDED.filter_cutoff or math.inf  # Hz, of the low-pass before everything
 RELATIVE = "relative_power"
 WIDE = 28
+BY_ITSELF = ", found automatically"
+WITHIN = "± is from within one recording; between trials we saw about twice as much"
 WORDS = {
     MEAN: "mean",
     "standard_deviation": "standard deviation",
@@ -23,62 +26,52 @@ REGULAR = {
     "sample_entropy": "sample entropy",
     "dfa_exponent": "DFA exponent",
 }
-TREMOR = {
-    "tremor_p": "tremor, {:g} to {:g} Hz",
-    "tremor_frequency": "  frequency",
-    "tremor_size": "  size{}",
-    "tremor_detectable": "  size that would show",
-}
+TREMOR = "tremor, {:g} to {:g} Hz"
+TREMOR_SIZES = ("tremor_size", "tremor_detectable")
+
+
+def read_line(
+    name: str, count: int, quantity: str | None, unit: str | None, seconds: Sequence[float]
+) -> str:
+    """What was read: "p01_rest   3 trials of torque (N m), 13.4 s each"."""
+    trials = f"{count} trials" if count > 1 else "1 trial"
+    short, long = min(seconds), max(seconds)
+    lasted = f"{short:.1f} s" + f" to {long:.1f} s" * (long > 1.01 * short)
+    of = f"{quantity or 'signal'}{f' ({unit})' * (unit is not None)}"
+    return f"{name}   {trials} of {of}, {lasted}{' each' * (count > 1)}"
+
+
+def heading(title: str) -> str:
+    """The heading of measured numbers, which stand two columns further in."""
+    return f"{title:<{2 + WIDE + 25}} 95 % interval"
 
 
 def measured_lines(measures: Measures, band: tuple[float, float]) -> list[str]:
-    """All measures with errors and intervals, under a heading."""
+    """All measures with errors and intervals, but for shares of the variance."""
     # about a mean of zero there is nothing to relate a power to
     relative = math.isfinite(measures[VARIATION].value)
     square = squared(measures[MEAN].unit).replace("^2", "²")
-    lines = [f"{'':<{WIDE}}{'value ± standard error':<25} 95 % interval"]
-    lines += [measured_line(words, name, measures[name]) for name, words in WORDS.items()]
+    lines = [measured_line(words, name, measures[name]) for name, words in WORDS.items()]
     if LEVEL_NAME in measures:
-        lines.insert(2, measured_line("  over the MVC", LEVEL_NAME, measures[LEVEL_NAME]))
-    kinds = {
-        RELATIVE if relative else "power": (
-            "power by band, in millionths of the squared mean"
-            if relative
-            else f"power by band [{square}]"
-        ),
-        "share": "share of the variance",
-    }
-    for kind, heading in kinds.items():
-        lines.append(heading)
-        for name, edges in RANGES.items():
-            words = f"  {range_words(*edges)}"
-            lines.append(measured_line(words, f"{kind}{name}", measures[f"{kind}{name}"]))
+        lines.insert(1, measured_line("  over the MVC", LEVEL_NAME, measures[LEVEL_NAME]))
+    lines.append(f"power by band, {'1e-6 mean²' if relative else square}")
+    for name, edges in RANGES.items():
+        key = f"{RELATIVE if relative else 'power'}{name}"
+        lines.append(measured_line(f"  {range_words(*edges)}", key, measures[key]))
     lines += [measured_line(words, name, measures[name]) for name, words in REGULAR.items()]
     return lines + tremor_lines(measures, band)
 
 
-def tremor_lines(
-    measures: Measures, band: tuple[float, float], *, short: bool = False
-) -> list[str]:
-    """Whether there is one; its frequency and size, or the size that would have shown; `short`,
-    without the p-value of one that is seen."""
-    p, seen = measures["tremor_p"].value, measures["tremor_frequency"]
-    first = TREMOR["tremor_p"].format(*band)
-    of = " over the mean" * (measures["tremor_detectable"].unit == "1")
-    if short and not math.isfinite(seen.value):
-        least = measures["tremor_detectable"]
-        told = measured_line("", "tremor_detectable", least).strip()
-        would = f"; {told} would show" * math.isfinite(least.value)
-        return [f"{first:<{WIDE}}none seen, {probability(p)}{would}"]
-    if short:
-        rows = {"tremor_frequency": first, "tremor_size": TREMOR["tremor_size"].format(of)}
+def tremor_lines(measures: Measures, band: tuple[float, float]) -> list[str]:
+    """The frequency of a tremor and its size, or that none is seen and which size would show."""
+    first, least = TREMOR.format(*band), measures["tremor_detectable"]
+    if math.isfinite(measures["tremor_frequency"].value):
+        of = " over the mean" * (least.unit == "1")
+        rows = {"tremor_frequency": first, "tremor_size": f"  size{of}"}
         return [measured_line(words, name, measures[name]) for name, words in rows.items()]
-    here = math.isfinite(seen.value)
-    lines = [f"{first:<{WIDE}}{'seen' if here else 'none seen'}, {probability(p)}"]
-    for name in list(TREMOR)[1:3] if here else list(TREMOR)[3:]:
-        if math.isfinite(measures[name].value):
-            lines.append(measured_line(TREMOR[name].format(of), name, measures[name]))
-    return lines
+    told = measured_line("", "tremor_detectable", least).strip()
+    would = f"; {told} would show" * math.isfinite(least.value)
+    return [f"{first:<{WIDE}}none seen, {probability(measures['tremor_p'].value)}{would}"]
 
 
 def range_words(low: float, high: float) -> str:
@@ -89,7 +82,7 @@ def range_words(low: float, high: float) -> str:
 def measured_line(words: str, name: str, m: Measure) -> str:
     """A measure with its error and interval; the ends have as many places as value and error."""
     percent = name.startswith((VARIATION, LEVEL_NAME, "share")) or (
-        name in TREMOR and m.unit == "1"
+        name in TREMOR_SIZES and m.unit == "1"
     )
     bare = m.unit == "1" or name.startswith("power")
     scale, unit = (

@@ -14,6 +14,7 @@ from jaxmuscle._common.arguments import require
 from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import nulled, write_json
+from jaxmuscle._common.names import name_of_all
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.spectra._bin_law import ENOUGH
@@ -33,8 +34,8 @@ from ._measured import (
     measure_signals,
     searched_band,
 )
-from ._measured_text import measured_lines, range_words
-from ._recording import SEGMENTS, SHORTEST, Recording, notices_of, unlike
+from ._measured_text import BY_ITSELF, WITHIN, heading, measured_lines, range_words, read_line
+from ._recording import FOUND, SEGMENTS, SHORTEST, UNRAMPED, Recording, notices_of, unlike
 from ._trials import Trials
 
 if TYPE_CHECKING:
@@ -44,14 +45,6 @@ if TYPE_CHECKING:
 
 ALL = "all"
 ALIKE = 1.2  # longest trial over shortest
-PEAK = (
-    "A tremor is stated if the spectrum has a peak that at most 1 in 100 smooth spectra would show"
-    " by chance (p <= 0.01)."
-)
-UNSEEN = (
-    " A tremor of the size that would show is seen in nine of ten such recordings; a smaller one"
-    " may be there unseen."
-)
 NEXT, WANDERS = 12, 0.05  # ordinates; level of the test whether the slowest of them stand out
 
 
@@ -118,27 +111,14 @@ class Steadiness(Printed, Result, eqx.Module):
         return plot.steadiness(self, ax)
 
     def __str__(self) -> str:
-        count, seconds = len(self.trials), self.durations.values()
-        short, long = min(seconds), max(seconds)
-        lasted = f"{short:.3g} s" + f" to {long:.3g} s each" * (long > 1.01 * short)
-        what = f"{count} trials" if count > 1 else next(iter(self.trials))
-        head = f"Steadiness of {what}: {self.quantity or 'signal'} [{self.unit}], {lasted}"
-        unseen = UNSEEN if math.isnan(self.measures["tremor_frequency"].value) else ""
-        notices = [f"notice: {notice}" for notice in self.notices]
-        numbers = measured_lines(self.measures, self.band)
-        return folded([head, *numbers, _errors_in_words(count), PEAK + unseen, *notices])
-
-
-def _errors_in_words(count: int) -> str:
-    """What the errors contain."""
-    if count >= ENOUGH:
-        return f"± is the standard error, from the scatter between the {count} trials."
-    return (
-        f"± is the standard error. It is estimated within {'the' if count == 1 else 'each'}"
-        " recording: for entropies and DFA from its four parts, for tremor and median frequency"
-        " from its Welch segments, for all else from its spectrum. So it does not say how the"
-        " next recording differs: between trials of one person we saw about twice as much."
-    )
+        seconds = list(self.durations.values())
+        count, chosen = len(seconds), any(notice.startswith(FOUND) for notice in self.notices)
+        head = read_line(name_of_all(list(self.trials)), count, self.quantity, self.unit, seconds)
+        title = f"MEASURED{f'  ± from the scatter of {count} trials' * (count >= ENOUGH)}"
+        notices = [n for n in self.notices if FOUND not in n and UNRAMPED not in n]
+        checks = [f"CHECK  {n}" for n in (*notices, *[WITHIN] * (count < ENOUGH))]
+        rows = [f"  {row}" for row in measured_lines(self.measures, self.band)]
+        return folded([head + BY_ITSELF * chosen, heading(title), *rows, *checks])
 
 
 def _plain(measures: dict[str, Measure]) -> dict[str, Any]:

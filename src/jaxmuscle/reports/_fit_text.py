@@ -9,11 +9,14 @@ from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import WIDTH, folded, probability
 from jaxmuscle.data._measured import is_recorded, tremor_band
 from jaxmuscle.data._measured_text import (
+    BY_ITSELF,
     REGULAR,
-    TREMOR,
     WIDE,
+    WITHIN,
     WORDS,
+    heading,
     measured_line,
+    read_line,
     tremor_lines,
 )
 from jaxmuscle.data._recording import FOUND, UNRAMPED
@@ -24,14 +27,14 @@ from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import model_name
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._derived import MEANINGS, VARIATION
-from jaxmuscle.spectra._bin_law import ENOUGH, trial_samples
+from jaxmuscle.spectra._bin_law import ENOUGH, samples_of_trials
 from jaxmuscle.spectra._fluctuations import BANDS, in_bands
 
 from ._ladder_text import explain_choice, ladder_table
+from ._methods import windows_of
 
 LENGTHS = ("x_ref_w", "x_ref_z")
 OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
-INDENT = 2
 HALF_POWER = "half_power_frequency"
 BROAD = 1.7 * 3.92  # standard errors: an interval that is wider than theirs
 # measured numbers in words: all that a fit prints, those of its short text, and those that are left
@@ -72,7 +75,6 @@ KINDS = {
 }
 MOST = 3  # checks that are printed
 CAVEAT = "half-power frequency: beside a strong tremor its interval is too narrow"
-WITHIN = "± is from within one recording; between trials we saw about twice as much"
 CHOSEN = (
     "the model was chosen for these data alone: `jaxmuscle study` fits all people with one model"
 )
@@ -134,7 +136,7 @@ def fit_text(result: FitResult) -> str:
         words = FEW if missed or part.stiffness is not None else SHOWN
         if len(result.parts) > 1:
             words = {n: FEW[n] for n in ("mean", "coefficient_of_variation")}
-        lines += _measured(result, name, part, words, short=True)
+        lines += _measured(result, name, part, words)
     lines += _judged(result)
     if result.success and not missed:
         lines += _results(result)
@@ -149,37 +151,41 @@ def _read(result: FitResult, name: str, part: FittedPart) -> list[str]:
         called = f"{name}: {called}"
     bins, found = len(target.bins), []
     if bins and is_recorded(target.measured):
-        count, seconds = len(target.segments or ()), trial_samples(target) / target.settings.rate
-        unit = "" if target.unit is None else f" ({target.unit})"
-        each = " each" * (count > 1)
-        found.append(f"{'1 trial' if count == 1 else f'{count} trials'} of {target.quantity}{unit}")
+        # a spectrum keeps the windows of its trials in words, or only how many segments they have
+        seconds = [stop - start for _, start, stop in windows_of(target)] or [
+            samples / target.settings.rate for samples in samples_of_trials(target)
+        ]
+        count = len(target.segments or ())
+        line = read_line(called, count, target.quantity, target.unit, seconds)
         chosen = any(notice.startswith(FOUND) for notice in target.notices)
-        found.append(f"{seconds:.1f} s{each}{', found automatically' * chosen}")
+        found.append(f"{line}{BY_ITSELF * chosen}")
     elif bins:
-        found.append(f"spectrum of {target.quantity} ({target.provenance}), {bins} bins")
+        spectrum = f"spectrum of {target.quantity} ({target.provenance})"
+        found.append(f"{called}   {spectrum}, {bins} bins")
         if target.segments is not None:
             found.append(f"{sum(target.segments)} segments")
     if part.stiffness is not None and target.stiffness is not None:
         f = target.stiffness.known.frequency
-        found.append(f"dynamic stiffness, {f[0]:.2g} to {f[-1]:.2g} Hz")
-    return [f"{called}   {', '.join(found)}"]
+        said = f"dynamic stiffness, {f[0]:.2g} to {f[-1]:.2g} Hz"
+        found.append(said if found else f"{called}   {said}")
+    return [", ".join(found)]
 
 
 def _measured(
-    result: FitResult, name: str, part: FittedPart, words: Mapping[str, str], *, short: bool
+    result: FitResult, name: str, part: FittedPart, words: Mapping[str, str]
 ) -> list[str]:
     """Measured numbers of one target by these words, then its tremor."""
     found = part.target.measured
     rows = [measured_line(said, key, found[key]) for key, said in words.items() if key in found]
-    if found.keys() >= TREMOR.keys():
-        lines = tremor_lines(found, tremor_band(part.target.quantity), short=short)
+    if "tremor_frequency" in found:
+        lines = tremor_lines(found, tremor_band(part.target.quantity))
         rows += lines[: 1 if len(words) <= len(FEW) else None]
     if not rows:
         return []
     of = f" of {name}" * (len(result.parts) > 1)
     return [
-        f"{f'MEASURED{of}':<{INDENT + WIDE + 25}} 95 % interval",
-        *(f"{'':{INDENT}}{row}" for row in rows),
+        heading(f"MEASURED{of}"),
+        *(f"  {row}" for row in rows),
     ]
 
 
@@ -288,7 +294,7 @@ def fit_details(result: FitResult) -> str:
     parameter, what the data do not determine and what they leave open."""
     lines = [_head(result)]
     for name, part in result.parts.items():
-        lines += _measured(result, name, part, ALL, short=False)
+        lines += _measured(result, name, part, ALL)
         if _is_within(part):
             lines.append(f"  {WITHIN}")
     lines += _judged(result)
