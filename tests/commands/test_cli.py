@@ -1140,10 +1140,7 @@ def test_steadiness_of_trials(tmp_path):
         files.append(tmp_path / f"trial{i}.csv")
         files[-1].write_text(f"time (s),force (N)\n{rows}")
     result = run("steadiness", *files[:3], "--window", "0:8,1:8,0:8", "--out", tmp_path / "out")
-    assert (
-        result.exit_code == 0
-        and "3 trials of force (N), 7.0 s to 8.0 s each" in result.stdout
-    )
+    assert result.exit_code == 0 and "3 trials of force (N), 7.0 s to 8.0 s each" in result.stdout
     windows = ((0, 8), (1, 8), (0, 8))
     each = zip(files, windows, strict=False)
     found = jm.data.steadiness(

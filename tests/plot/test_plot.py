@@ -386,7 +386,9 @@ def test_the_words_below_a_fit_of_two_resonances_find_room_in_its_width():
 )
 def test_a_tremor_outside_the_bins_or_without_power_is_not_marked_there(frequency, share, words):
     ax = panels(plot.fit(of_two_resonances(share, resonance_frequency=frequency)))[0]
-    assert [str(x.get_label()) for x in ax.lines if "resonance, " in str(x.get_label())] == words
+    assert [
+        str(x.get_label()) for x in ax.lines if str(x.get_label()).startswith("resonance, ")
+    ] == words
     assert not [line for line in ax.lines if list(line.get_xdata()) == [frequency, frequency]]
 
 
