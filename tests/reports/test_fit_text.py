@@ -93,7 +93,7 @@ def test_the_text_of_a_spectrum_is_short():
         "(per newton of mean force)",
         "NOT KNOWN from these data: active stiffness",
         "CHECK a notice",
-        "everything else: `jaxmuscle fit -v`, fit.json; in Python result.details()",
+        "everything else: the same command with -v; in Python result.details()",
     )
     words = words_of(text)
     places = [words.index(part) for part in in_order]
@@ -254,7 +254,7 @@ def test_a_model_that_misses_the_data_prints_none_of_its_numbers():
         "MODEL slow part + regular rhythm: does NOT fit, p <= 0.001",
         "The data have more power than the model from 7 to 9 Hz (12.0 standard errors).",
         "1 other model fitted worse.",
-        "Report what is measured, and that the model does not fit. More: `fit -v`",
+        "Report what is measured, and that the model does not fit. More: -v",
     )
     places = [words.index(part) for part in in_order]
     assert places == sorted(places)

@@ -382,13 +382,14 @@ def report_fit(
         singular_values=known.singular_values,
         profile=None if line_test is None else (line_test.frequency, line_test.rise),
         harmonic_p_value=None if line_test is None else line_test.p_value,
+        # the gravest first: a printed result shows few of them
         notices=(
-            *notices,
             *ended.judged[1],
             *mass_notices(problem.coordinates, theta),
-            *array_notices(tasks),
             *reach_notices(derived, parts),
             *polish_notices(polish),
+            *notices,
+            *array_notices(tasks),
             *of_several(parts),
             *unsimulated(plan, stages),
             *beyond,

@@ -54,7 +54,7 @@ RHYTHMS = {
     "harmonic_frequency": "frequency of the rhythm",
     HALF_POWER: "half-power frequency",
 }
-STIFFNESS = ("tangent_stiffness", "K_w_tangent", "K_z0", "C_w0", "C_z0")
+STIFFNESS = ("tangent_stiffness", "K_w_tangent", "K_z0", "C_w0", "C_z0", "m_z")
 # what a number that the data do not determine belongs to, by the beginning of its name
 KINDS = {
     "active stiffness": ("k_w", "K_w"),
@@ -62,7 +62,8 @@ KINDS = {
     "active damping": ("c_w", "C_w"),
     "passive damping": ("c_z", "C_z"),
     "stiffness of both tissues": ("tangent_stiffness",),
-    "mass": ("m_",),
+    "mass of the active tissue": ("m_w",),
+    "moved mass": ("m_z",),
     "lengths": ("x_ref",),
     "nervous drive": ("P_w",),
     "noise": ("noise_",),
@@ -79,8 +80,8 @@ CHOSEN = (
     "the model was chosen for these data alone: `jaxmuscle study` fits all people with one model"
 )
 IN_SERIES = "active and passive tissue in series"  # where no spectrum was fitted
-REPORT = "Report what is measured, and that the model does not fit. More: `fit -v`"
-EVERYTHING = "everything else: `jaxmuscle fit -v`, fit.json; in Python result.details()"
+REPORT = "Report what is measured, and that the model does not fit. More: -v"
+EVERYTHING = "everything else: the same command with -v; in Python result.details()"
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 
 
@@ -234,7 +235,7 @@ def _results(result: FitResult) -> list[str]:
         line = f"  {words:<{WIDE}}{p.in_words() + unit:<25} {p.interval_in_words()}"
         lines.append(line.rstrip())
     lines += [f"   {_per_newton(result, rows)}"] * bool(_per_newton(result, rows))
-    if recorded and len(result.ladder) > 1:
+    if recorded and not moved and len(result.ladder) > 1:
         lines.append(f"  {CHOSEN}")
     loose = [n for n, p in every.items() if p.stderr is None and p.free]
     if unknown := unknown_kinds(loose, rows):

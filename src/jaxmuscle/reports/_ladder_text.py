@@ -4,7 +4,7 @@ import itertools
 
 from jaxmuscle._common.text import probability
 from jaxmuscle.fits._result import Rung
-from jaxmuscle.model._rungs import RICHER
+from jaxmuscle.model._rungs import QUIET, RICHER
 
 
 def ladder_table(ladder: tuple[Rung, ...], datum: str) -> list[str]:
@@ -45,11 +45,14 @@ def explain_choice(
             f"the spectrum shows a tremor{' and a slower peak' * slower}, so the first model tried"
             f" has {'two resonances' if slower else 'a resonance'}"
         )
-    if numbers[0] < first:
+    if numbers[0] == QUIET and len(ladder) > 1:
+        said.append("the slow part alone was fitted first. Its spectrum shows a line, or it misses")
+        said[-1] += " the data: so richer models were tried"
+    elif numbers[0] < first:
         said.append(
             "that came out narrower than a bin, so models with a line of zero width were tried, too"
         )
-    if numbers[-1] > first:
+    elif numbers[-1] > first:
         poorer = next(rung for rung in ladder if rung.number == first)
         said.append(
             f"{poorer.model} does not describe the data ({probability(poorer.p)}). Richer models"
