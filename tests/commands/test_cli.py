@@ -400,10 +400,16 @@ def test_verbose_prints_everything(tmp_path, monkeypatch):
     short = run("fit", path, "--out", tmp_path / "short")
     whole = run("fit", path, "-v", "--out", tmp_path / "whole")
     assert short.exit_code == whole.exit_code == 0
-    assert short.stdout.startswith(str(made_result()))
+    again = run("fit", tmp_path / "short" / "fit.json")
+    assert again.exit_code == 0 and short.stdout.startswith(again.stdout)
+    assert str(made_result()).splitlines()[:8] == again.stdout.splitlines()[:8]
     assert whole.stdout.startswith(made_result().details())
     assert "models tried" in whole.stdout and "models tried" not in short.stdout
-    assert "command with -v" in short.stdout and "command with -v" not in whole.stdout
+    more = f"jaxmuscle fit {tmp_path / 'short' / 'fit.json'} -v"
+    assert more in " ".join(short.stdout.split()) and "All numbers" not in whole.stdout
+    assert (
+        run("fit", tmp_path / "short" / "fit.json", "-v").stdout == made_result().details() + "\n"
+    )
     kept, same = ((tmp_path / name / "fit.json").read_bytes() for name in ("short", "whole"))
     assert kept == same
 

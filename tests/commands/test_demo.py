@@ -112,7 +112,7 @@ def test_pages_quote_what_is_printed(folder, study, monkeypatch):
     """Each line of an output in README and tutorials; their Python is run."""
     monkeypatch.chdir(folder.parent)
     steadiness = pages.run("docs/tutorial-steadiness.md")["found"]
-    measured = "sim01_tired   3 trials of force (N), 14.3 s each, found automatically"
+    measured = "sim01_tired   3 trials of force (N), 14.3 s each (steady part, automatic)"
     table = "STUDY  6 people in 2 conditions (rest; tired)"
     for page, first, result in (
         ("README.md", measured, steadiness),

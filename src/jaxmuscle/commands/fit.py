@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -73,7 +73,7 @@ def fit(
         typer.Argument(
             help=(
                 "A bundled spectrum (see `jaxmuscle targets`), your spectra (.toml, .csv), or"
-                " your recordings."
+                " your recordings; or the fit.json of an earlier fit, to print it again."
             )
         ),
     ],
@@ -235,8 +235,12 @@ def fit(
         jaxmuscle fit people/*.toml --groups groups.csv --out out/cohort
 
         jaxmuscle fit figure.csv --dataset "95 MVC" --segments 6
+
+        jaxmuscle fit out/fit/fit.json --verbose
     """
     with reporting(as_json):
+        if len(target) == 1 and target[0].lower().endswith(".json"):
+            _print_again(Path(target[0]), verbose=verbose)
         options: dict[str, Any] = {
             "fix": fixed_values(fix),
             "free": names_in(free),
@@ -419,6 +423,21 @@ def _aim_at_spectrum(
     return aim_of(name, task, {"segments": read["segments"], "lever_arm": reading["lever_arm"]})
 
 
+def _print_again(path: Path, *, verbose: bool) -> NoReturn:
+    """Print an earlier fit, and end as that did."""
+    result = jm.load_result(path)
+    record(path)
+    _say(result, path, verbose=verbose)
+    raise typer.Exit(CONVERGED if result.success else NOT_CONVERGED)
+
+
+def _say(result: Any, saved: Path, *, verbose: bool) -> None:
+    from jaxmuscle.reports import fit_text
+
+    text = result.details() if verbose else fit_text(result, str(saved))
+    show(text, success=result.success and result.adequate is not False)
+
+
 def _fit_one(
     fit: Callable[..., Any],
     called: str,
@@ -435,10 +454,6 @@ def _fit_one(
         reached.append(result)
         stays(f"{STAYS}; not checked: {folder / 'fit.json'}")
 
-    def say(result: Any) -> None:
-        text = result.details() if verbose else result
-        show(text, success=result.success and result.adequate is not False)
-
     stays(NOTHING)
     try:
         with told(True, f"fitting {called}") as tell:
@@ -450,7 +465,7 @@ def _fit_one(
             write_reached(stop, folder)
         write_fit(stop.result, folder)
         record(folder / "fit.json")
-        say(stop.result)
+        _say(stop.result, folder / "fit.json", verbose=verbose)
         err.print(f"interrupted: what had been reached is in {plain(folder)}")
         raise typer.Exit(interrupted()) from None
     except KeyboardInterrupt:
@@ -461,6 +476,6 @@ def _fit_one(
         err.print(f"interrupted: {NOTHING}")
         raise typer.Exit(interrupted()) from None
     record(folder / "fit.json")
-    say(result)
+    _say(result, folder / "fit.json", verbose=verbose)
     say_written(folder, *files)
     return result.success

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 from jaxmuscle._common.text import probability, squared
+from jaxmuscle.spectra._bin_law import ENOUGH
 
 from ._measure import Measure
 from ._measured import FAST, LEVEL_NAME, MEAN, MEDIAN, RANGES, RECORDED, VARIATION, Measures
@@ -11,7 +12,7 @@ from ._measured import FAST, LEVEL_NAME, MEAN, MEDIAN, RANGES, RECORDED, VARIATI
 CUT_OFF = RECORDED.filter_cutoff or math.inf  # Hz, of the low-pass before everything
 RELATIVE = "relative_power"
 WIDE = 28
-BY_ITSELF = ", found automatically"
+BY_ITSELF = " (steady part, automatic)"
 WITHIN = "± is from within one recording; between trials we saw about twice as much"
 WORDS = {
     MEAN: "mean",
@@ -39,6 +40,11 @@ def read_line(
     lasted = f"{short:.1f} s" + f" to {long:.1f} s" * (long > 1.01 * short)
     of = f"{quantity or 'signal'}{f' ({unit})' * (unit is not None)}"
     return f"{name}   {trials} of {of}, {lasted}{' each' * (count > 1)}"
+
+
+def scatter_of(trials: int) -> str:
+    """On what the errors stand, where trials tell them."""
+    return f"  ± from the scatter of {trials} trials" * (trials >= ENOUGH)
 
 
 def heading(title: str) -> str:

@@ -34,7 +34,15 @@ from ._measured import (
     measure_signals,
     searched_band,
 )
-from ._measured_text import BY_ITSELF, WITHIN, heading, measured_lines, range_words, read_line
+from ._measured_text import (
+    BY_ITSELF,
+    WITHIN,
+    heading,
+    measured_lines,
+    range_words,
+    read_line,
+    scatter_of,
+)
 from ._recording import FOUND, SEGMENTS, SHORTEST, UNRAMPED, Recording, notices_of, unlike
 from ._trials import Trials
 
@@ -114,7 +122,7 @@ class Steadiness(Printed, Result, eqx.Module):
         seconds = list(self.durations.values())
         count, chosen = len(seconds), any(notice.startswith(FOUND) for notice in self.notices)
         head = read_line(name_of_all(list(self.trials)), count, self.quantity, self.unit, seconds)
-        title = f"MEASURED{f'  ± from the scatter of {count} trials' * (count >= ENOUGH)}"
+        title = f"MEASURED{scatter_of(count)}"
         notices = [n for n in self.notices if FOUND not in n and UNRAMPED not in n]
         checks = [f"CHECK  {n}" for n in (*notices, *[WITHIN] * (count < ENOUGH))]
         rows = [f"  {row}" for row in measured_lines(self.measures, self.band)]

@@ -62,6 +62,10 @@ BY_SIMULATION = (
     "Check with a fit by simulation, of one target at a time (--method montecarlo,"
     " method='montecarlo')"
 )
+NARROW = (
+    "beside a tremor the interval of half_power_frequency is too narrow. It held the true value in"
+    " 24 of 30 simulated recordings, not in 28 or 29. What to do: do not rest a conclusion on it"
+)
 FAST = (
     "The relaxation of the muscle smooths the force in the same way and may have taken its place."
     " Or power at high frequencies comes from elsewhere, as from the sensor"
@@ -295,6 +299,16 @@ def twitch_notices(found: Mapping[str, Estimate]) -> tuple[str, ...]:
                 " activation_time at a value that you know"
             )
     return tuple(said)
+
+
+def narrow_notices(
+    found: Mapping[str, Estimate], parts: Mapping[str, FittedPart]
+) -> tuple[str, ...]:
+    """The notice of a half-power frequency beside a tremor that is seen."""
+    seen = [part.target.measured.get("tremor_frequency") for part in parts.values()]
+    trembles = any(m is not None and np.isfinite(m.value) for m in seen)
+    stated = any(base_of(n) == "half_power_frequency" and p.stderr for n, p in found.items())
+    return (NARROW,) * (trembles and stated)
 
 
 def mass_notices(coordinates: Coordinates, theta: Float[np.ndarray, " free"]) -> tuple[str, ...]:

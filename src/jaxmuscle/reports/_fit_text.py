@@ -17,6 +17,7 @@ from jaxmuscle.data._measured_text import (
     heading,
     measured_line,
     read_line,
+    scatter_of,
     tremor_lines,
 )
 from jaxmuscle.data._recording import FOUND, UNRAMPED
@@ -35,7 +36,6 @@ from ._methods import windows_of
 
 LENGTHS = ("x_ref_w", "x_ref_z")
 OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
-HALF_POWER = "half_power_frequency"
 BROAD = 1.7 * 3.92  # standard errors: an interval that is wider than theirs
 # measured numbers in words: all that a fit prints, those of its short text, and those that are left
 # there where the model does not fit
@@ -49,10 +49,10 @@ SHOWN = {name: words for name, words in ALL.items() if name != "standard_deviati
 FEW = {n: SHOWN[n] for n in ("mean", "coefficient_of_variation", "relative_power_8_12")}
 # numbers of the model that it prints, in words: of a held force, and of a moved limb
 RHYTHMS = {
-    "resonance_frequency": "frequency of the resonance",
-    "resonance_2_frequency": "frequency of the second one",
-    "harmonic_frequency": "frequency of the rhythm",
-    HALF_POWER: "half-power frequency",
+    "resonance_frequency": "resonance of the drive",
+    "resonance_2_frequency": "second resonance",
+    "harmonic_frequency": "regular rhythm",
+    "half_power_frequency": "half-power frequency",
 }
 STIFFNESS = ("tangent_stiffness", "K_w_tangent", "K_z0", "C_w0", "C_z0", "m_z")
 # what a number that the data do not determine belongs to, by the beginning of its name
@@ -71,17 +71,16 @@ KINDS = {
     "corner frequency": ("corner_frequency",),
     "half-power frequency": ("half_power_frequency",),
     "regular rhythm": ("harmonic_",),
+    "second resonance": ("resonance_2_",),
     "resonance": ("resonance_",),
     "": ("model_", *BANDS),  # these are measured
 }
 MOST = 3  # checks that are printed
-CAVEAT = "half-power frequency: beside a strong tremor its interval is too narrow"
 CHOSEN = (
     "the model was chosen for these data alone: `jaxmuscle study` fits all people with one model"
 )
 IN_SERIES = "active and passive tissue in series"  # where no spectrum was fitted
-REPORT = "Report what is measured, and that the model does not fit. More: -v"
-EVERYTHING = "everything else: the same command with -v; in Python result.details()"
+REPORT = "Report only what is measured."
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 
 
@@ -125,9 +124,11 @@ def _heading(result: FitResult) -> str:
     return f"{subject} {result.verdict}"
 
 
-def fit_text(result: FitResult) -> str:
+def fit_text(result: FitResult, saved: str | None = None) -> str:
     """What was read, what is measured, whether the model describes it, what then is known of the
     model, and what is not; at most 24 lines for one target, 12 where the model does not fit.
+
+    `saved`: the file of the result, for whoever reads this in a terminal.
 
     The numbers of a model that does not describe the data are left to `fit_details`.
     """
@@ -140,9 +141,15 @@ def fit_text(result: FitResult) -> str:
         lines += _measured(result, name, part, words)
     lines += _judged(result)
     if result.success and not missed:
-        lines += _results(result)
-    lines += _checks(result, MOST if len(result.parts) == 1 and not missed else 1)
-    return folded([*lines, *[EVERYTHING] * (not missed)])
+        lines += _results(result, saved)
+    checks = _checks(result)
+    several, hidden = len(result.parts) > 1, len(checks)
+    if not missed:
+        shown = 1 if several else MOST
+        lines, hidden = [*lines, *checks[:shown]], max(0, hidden - shown)
+    more = "print(result.details())" if saved is None else f"jaxmuscle fit {saved} -v"
+    noted = f", {hidden} more notice{'s' * (hidden > 1)}" * (hidden > 0)
+    return folded([*lines, f"All numbers{noted}: {more}"])
 
 
 def _read(result: FitResult, name: str, part: FittedPart) -> list[str]:
@@ -180,12 +187,12 @@ def _measured(
     rows = [measured_line(said, key, found[key]) for key, said in words.items() if key in found]
     if "tremor_frequency" in found:
         lines = tremor_lines(found, tremor_band(part.target.quantity))
-        rows += lines[: 1 if len(words) <= len(FEW) else None]
+        rows += lines if len(result.parts) == 1 else lines[:1]
     if not rows:
         return []
     of = f" of {name}" * (len(result.parts) > 1)
     return [
-        heading(f"MEASURED{of}"),
+        heading(f"MEASURED{of}{scatter_of(len(part.target.segments or ()))}"),
         *(f"  {row}" for row in rows),
     ]
 
@@ -201,16 +208,13 @@ def _judged(result: FitResult) -> list[str]:
         return [f"MODEL  {name}: {result.verdict}"]
     if verdict.adequate:
         return [f"MODEL  {name}: fits, {probability(verdict.p)}"]
-    others = len(result.ladder) - 1
-    tried = f" {others} other model{'s' * (others > 1)} fitted worse." * (others > 0)
     return [
         f"MODEL  {name}: does NOT fit, {probability(verdict.p)}",
-        f"  {verdict.misfit[0].upper()}{verdict.misfit[1:]}.{tried}",
-        f"  {REPORT}",
+        f"  {verdict.misfit[0].upper()}{verdict.misfit[1:]}. {REPORT}",
     ]
 
 
-def _results(result: FitResult) -> list[str]:
+def _results(result: FitResult, saved: str | None) -> list[str]:
     """What is known of the model, in rows, and what these data do not tell."""
     every, shown = result.as_shown(result.found), result.as_shown(result.determined)
     recorded = any(is_recorded(part.target.measured) for part in result.parts.values())
@@ -240,7 +244,10 @@ def _results(result: FitResult) -> list[str]:
     loose = [n for n, p in every.items() if p.stderr is None and p.free]
     if unknown := unknown_kinds(loose, rows):
         lines.append(f"NOT KNOWN from these data: {', '.join(unknown)}")
-        lines.append("  `jaxmuscle identifiability fit.json` says what would tell")
+        command = f"jaxmuscle identifiability {saved}"
+        lines.append(
+            f"  What would tell: {'jm.identifiability(result)' if saved is None else command}"
+        )
     return lines
 
 
@@ -261,21 +268,13 @@ def _kind(name: str) -> str:
     return next((kind for kind, begins in KINDS.items() if base.startswith(begins)), base)
 
 
-def _checks(result: FitResult, most: int) -> list[str]:
-    """The first sentences of what should be looked at, so many; and how many more there are."""
+def _checks(result: FitResult) -> list[str]:
+    """The first sentences of what should be looked at, the gravest first."""
     within = any(map(_is_within, result.parts.values()))
-    known = {base_of(name) for name in result.determined}
-    narrow = HALF_POWER in known and (_trembles(result) or "resonance_share" in known)
-    narrow = narrow and result.adequate is not False
     poor = [] if not result.success or result.message.startswith(CONVERGED) else [result.message]
     # the windows stand in the first line
     seen = [n for n in result.notices if FOUND not in n and UNRAMPED not in n]
-    said = [
-        _in_short(sentence) for sentence in (*poor, *[CAVEAT] * narrow, *seen, *[WITHIN] * within)
-    ]
-    more = f" ({len(said) - most} more)" * (len(said) > most)
-    lines = [f"CHECK  {sentence}" for sentence in said[:most]]
-    return [*lines[:-1], f"{lines[-1]}{more}"] if lines else []
+    return [f"CHECK  {_in_short(said)}" for said in (*poor, *seen, *[WITHIN] * within)]
 
 
 def _in_short(notice: str) -> str:
