@@ -37,7 +37,7 @@ def gain(
         ax.plot(fine, np.abs(smooth), color=BLUE, lw=1.2, label=name, zorder=2)
     log_axis(ax, "y")
     log_axis(ax)
-    ax.set_ylabel("Gain (N/m)")
+    ax.set_ylabel(f"Gain ({response.unit})")
     ax.set_title(title, parse_math=False)
     legend(ax, "above")
 
