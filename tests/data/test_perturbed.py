@@ -484,6 +484,34 @@ def test_steady_part_and_window():
         whole.steady((10, 14)).frequency_response()
 
 
+def test_the_hold_of_a_force_that_answers_as_no_spring_does():
+    """An answer that comes 60 ms late and drifts, of 40 % of the force; a joint without a force."""
+    moved, *_ = drawn(1, 0.05)
+    x, still = moved[0], np.zeros(500)
+    late = np.concatenate([np.zeros(6), x[:-6]])
+    slow = scipy.signal.lfilter([0.02], [1, -0.98], np.random.default_rng(3).normal(size=x.size))
+    slow *= 0.15 / slow.std()
+    for weak in (3.0, 0.0):
+        answer = weak * slow + (0.7 * late + 0.7 * np.roll(late, 40)) / np.std(x)
+        ramp = np.linspace(0, weak, 500)
+        noise = 0.01 * np.random.default_rng(4).standard_normal(x.size + 1000)
+        whole = recorded(
+            np.concatenate([still, x, still]),
+            noise + np.concatenate([ramp, weak + answer, ramp[::-1]]),
+            positive="lengthening",
+        )
+        held = whole.steady()
+        assert held.window is not None and held.force.window == held.displacement.window
+        a, b = held.window
+        assert 4.9 < a < b < 65.1 and b - a > 45
+        assert noticed(held, "where the insertion moves")
+        kind = "within half of its level" if weak else "having no level of its own"
+        assert noticed(held, kind)
+    ramped = recorded(np.concatenate([still, x, still]), np.linspace(0, 50, x.size + 1000) ** 2)
+    with pytest.raises(ValueError, match="no steady part was found"):
+        ramped.steady()
+
+
 def test_the_hold_of_a_weak_force_that_answers_with_half_of_itself():
     moved, force, _ = drawn(1, 0.05)
     weak, still = 3.0, 0 * np.linspace(0, 1, 300)

@@ -22,9 +22,9 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._frequency_response import JOINT, FrequencyResponse
 from ._measure import Measure, normal_interval
-from ._recording import Recording, pooled_target, recorded_settings
+from ._recording import FOUND, Recording, pooled_target, recorded_settings
 from ._recording_choice import About
-from ._recording_quality import Baseline, signal_of
+from ._recording_quality import Baseline, running_median, runs, signal_of
 from ._second_order import UNITS, SecondOrder, lateness, lengthens, second_order_fit
 from ._target import Target
 from ._units import quantity_of, scale_to_si
@@ -45,6 +45,9 @@ NEGATIVE = (
     " wrong sign"
 )
 CUT = 0.1  # s
+# Where the insertion moves: at how many Hz that is looked at; from which share of the usual
+# standard deviation on. For which share of the time a force without a level pulls either way.
+WATCHED, STILL_SHARE, BOTH = 100.0, 0.3, 0.1
 SHORTER = (
     "of the window from {:.4g} to {:.4g} s the fit uses {:.4g} to {:.4g} s: it needs {:g} s of the"
     " recording before and after what it uses. If you can, record that much longer"
@@ -289,7 +292,11 @@ class PerturbedRecording(Shown, eqx.Module):
 
         Where a weak force answers with more than a tenth of itself, so that none is found, it is
         looked for in what is left of the force without the answer of a spring, a damper and a mass.
-        Both channels are cut alike.
+        If that shows none either, as where a reflex answers, the longest stretch is taken in which
+        the insertion moves (its standard deviation over 2 s is above 0.3 of the usual one) and the
+        rest of the force, the median over 1 s, is within half of its level; with any force if that
+        pulls either way for a tenth of the time. It has to be half of the time with motion. Both
+        channels are cut alike.
 
         **Raises:** `ValueError` as `Recording.steady`.
         """
@@ -302,21 +309,55 @@ class PerturbedRecording(Shown, eqx.Module):
         except ValueError:
             if window is not None:
                 raise
-            found = self._without_answer().steady()  # or it raises the same
-            alone = force._with(window=None, notices=found.notices)
-            steady = alone.steady(found.window)
+            rest = self._without_answer()
+            try:
+                found = rest.steady()
+            except ValueError:
+                found = self._while_moved(rest)
+                if found is None:
+                    raise
+            steady = force._with(window=found.window, notices=found.notices)._straight()
         moved = self.displacement.steady("all" if steady.window is None else steady.window)
         return self._of(steady, moved)
 
     def _without_answer(self) -> Recording:
         """The force less `K x + B x' + I x''` of the displacement, by least squares over all of the
         recording."""
-        x = self.displacement.whole
+        x = self.displacement.whole - np.mean(self.displacement.whole)
         speed = np.gradient(x, 1 / self.rate)
         columns = np.stack([np.ones_like(x), x, speed, np.gradient(speed, 1 / self.rate)], axis=1)
         columns /= np.linalg.norm(columns, axis=0)
         sizes = np.linalg.lstsq(columns, self.force.whole, rcond=None)[0]
         return self.force._with(samples=self.force.whole - columns[:, 1:] @ sizes[1:], window=None)
+
+    def _while_moved(self, rest: Recording) -> Recording | None:
+        """What is left of the force, with the part as window in which the insertion moves and it
+        has one level."""
+        rate = WATCHED
+        moved, left = self.displacement.resampled(rate).whole, rest.resampled(rate).whole
+        size = round(2 * rate)
+        mean, square = (scipy.ndimage.uniform_filter1d(moved**n, size) for n in (1, 2))
+        scatter = np.sqrt(np.maximum(square - mean**2, 0.0))
+        moves = scatter > STILL_SHARE * np.quantile(scatter, 0.75)
+        held, level = running_median(left, rate), float(np.median(left[moves]))
+        if not BOTH < np.mean(held[moves] > 0) < 1 - BOTH:
+            inside = moves & (np.abs(held - level) < abs(level) / 2)
+            said = "and the force stays within half of its level"
+        else:
+            inside, said = moves, "the force having no level of its own"
+        longest = max(runs(inside).tolist(), key=lambda run: run[1] - run[0], default=[0, 0])
+        if longest[1] - longest[0] < 0.5 * np.sum(moves):
+            return None
+        # a second is left for the ramps
+        start, stop = (
+            longest[0] + round(rate) * (longest[0] > 0),
+            longest[1] - round(rate) * (longest[1] < moved.size),
+        )
+        a, b = (min(rest.start + edge / rate, rest.stop) for edge in (start, stop))
+        if (b - a) * rate < size:
+            return None
+        words = f"{FOUND}{a:.2f} s to {b:.2f} s, where the insertion moves, {said}"
+        return rest._with(window=(a, b), notices=(*rest.notices, words))
 
     def frequency_response(
         self, settings: SpectrumSettings | str | None = None
