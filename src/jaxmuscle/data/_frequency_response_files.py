@@ -60,7 +60,7 @@ def load_frequency_response(
     - `segments`: the number of independent averages, one or one for each frequency, needed without
       `stderr`
     - `lever_arm` [m]: which turns torque over angle into force over displacement, else it stays
-      such
+      such; of `stiffness.csv` that of the fit
     - `name`: by default that of the file
     - `source`
 
@@ -75,7 +75,8 @@ def load_frequency_response(
     try:
         if {*FITTED} <= {*table.columns}:
             frequency, real, imaginary, stderr = (_numbers(table, name, name) for name in FITTED)
-            return FrequencyResponse(frequency, real + 1j * imaginary, stderr, **words)
+            value = real + 1j * imaginary
+            return FrequencyResponse(frequency, value, stderr, lever_arm=lever_arm, **words)
         column = {}
         for role, (heading, unit) in _columns(table).items():
             column[role] = _numbers(table, heading, role) * UNITS[role][unit]

@@ -58,7 +58,9 @@ def phase(ax: Axes, response: Any, curve: Curve | None = None) -> None:
     ax.set_ylabel("Phase (deg)")
     low, high = ax.get_ylim()
     ax.yaxis.set_major_locator(
-        MultipleLocator(45 if high - low > 100 else 15 if high - low > 30 else 5)
+        MultipleLocator(
+            90 if high - low > 300 else 45 if high - low > 100 else 15 if high - low > 30 else 5
+        )
     )
     log_axis(ax)
 
