@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 import jaxmuscle as jm
 from jaxmuscle.fits._perturbed import alike, seen_with, without_rhythm
 from jaxmuscle.fits._verdict import Endpoint
+from jaxmuscle.objective._arguments import at_mean
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._two_tissues import two_tissues
@@ -672,3 +673,34 @@ def test_what_cannot_be_simulated_has_a_response_all_the_same(minute, monkeypatc
     assert "cannot be simulated (this task has an eigenvalue of 1e+09/s)" in found.notices[0]
     assert abs(found["K_z0"].value - WHOLE["K_z0"]) < 4 * found["K_z0"].stderr
     assert np.all(np.isfinite(found.stiffness))
+
+
+def test_the_prior_of_a_joint_is_carried_by_the_lever_arm():
+    """Centres in N m/rad, N m s/rad and kg m² are the same at any lever arm, and those of the
+    response; so they are where the force varies by more than its mean."""
+    f = np.geomspace(0.5, 30, 60)
+    h = 45.0 + 0.9 * 2j * np.pi * f - 0.015 * (2 * np.pi * f) ** 2
+    joint = jm.data.FrequencyResponse(f, h, 1e-3 * np.abs(h), unit="N m/rad")
+    spectrum = jm.data.load_target("vastus-lateralis-26mvc").proportional_power
+    base = jm.PrescribedLength()
+    for arm in (0.05, 0.1):
+        response = joint.at_lever_arm(arm)
+        for mean, varies in ((12.0, 0.02), (0.1, None)):
+            target = jm.Target(
+                "ankle",
+                spectrum,
+                quantity="force",
+                unit="N",
+                mean=[mean / arm],
+                segments=[40],
+                coefficient_of_variation=None if varies is None else [varies],
+                stiffness=response,
+            )
+            task, options = at_mean(base, target, FitOptions())
+            k_w, k_z, *_ = task.muscle.base()
+            assert arm**2 * k_w * k_z / (k_w + k_z) == pytest.approx(45.0, rel=1e-3)
+            assert arm**2 * float(task["m_z"]) == pytest.approx(0.015, rel=1e-3)
+            assert float(task["x_ref_w"]) == pytest.approx(0.02 * arm / 0.05)
+            ratio = [float(t["C_w0"]) ** 2 / float(t["K_w0"] * t["m_w"]) for t in (task, base)]
+            assert ratio[0] == pytest.approx(ratio[1])
+            assert (options.mean_force is None) == (varies is None)

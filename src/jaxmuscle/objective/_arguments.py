@@ -125,7 +125,8 @@ def at_mean(
     task: AbstractTask, target: Target, options: FitOptions
 ) -> tuple[AbstractTask, FitOptions]:
     """The task scaled to the target's mean force, where it states one in newtons, which then is
-    data; P_w follows from it.
+    data; P_w follows from it. A moved joint is carried to its response instead, and so is a moved
+    limb whose force varies by more than its mean.
 
     Not where the fit is given a `mean_force` (or False), where P_w is fixed, nor for a muscle that
     is not the paper's.
@@ -136,6 +137,10 @@ def at_mean(
     stated = target.mean_force if task.output_unit == "N" and is_scalable(task.muscle) else None
     response = target.stiffness if is_scalable(task.muscle) else None
     arm = None if response is None else response.lever_arm
+    varies = stated is not None and target.coefficient_of_variation is None
+    if response is not None and varies:
+        # a force that varies by more than its mean: that is no scale, and no datum
+        stated, arm = None, arm or LEVER_ARM
     if stated is None or level is None or level in (options.fix or {}):
         return task if arm is None else _on_joint(task, task, response, arm), options
     free = (*options.also_free, level)
