@@ -378,6 +378,7 @@ def test_checks_let_traced_values_through():
 
 
 def _tasks():
+    yield jm.PrescribedLength(reflex=jm.model.Reflex())
     noises = (jm.BandLimitedNoise(), jm.OrnsteinUhlenbeckNoise())
     smooth = jm.OrnsteinUhlenbeckNoise({"K_w": 0.1})
     white = jm.WhiteNoise({"K_w": 0.1, "C_w": 0.01})

@@ -208,6 +208,11 @@ def _models(
     first = first_rung([target], lowest, top) if top > lowest else lowest
     possible = target.stiffness is not None and not unknown and options.method == "linear"
     possible = possible and type(base) is PrescribedLength and base.reflex is None
+    require(
+        possible or options.reflex != "linear",
+        "reflex = 'linear': a reflex is fitted to a recording of a moved limb or to its response,"
+        " with a PrescribedLength without one, by the formula. Leave it out",
+    )
     return Models(
         first,
         lowest,

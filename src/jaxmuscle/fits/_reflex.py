@@ -19,13 +19,14 @@ from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
 from jaxmuscle.objective._arguments import Plan, planned
 from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._starts import OTHER_MODEL, SPREAD, starting_points
 from jaxmuscle.response._input_response import dynamic_stiffness
 
 from ._verdict import REPLICATES, Endpoint, generator_of, refitted_residuals
 
 SEEN = 0.01  # level of the test
 DELAYS = np.arange(0.02, 0.1301, 0.005)  # s
-TIMES = (0.03, 0.06)  # s, contraction times of the starts
+TIME = 0.05  # s, the contraction time with which it begins
 USUAL = 0.045  # s: a reflex that is left out is taken to have this delay
 POWER = 1.2816  # standard errors: nine of ten are seen
 STATED = ("tangent_stiffness", "K_w_tangent", "K_z0")
@@ -101,7 +102,7 @@ def _responses(ended: Endpoint, i: int) -> np.ndarray:
     task = ended.problem.tasks_at(ended.seen.theta)[i]
     assert isinstance(task, PrescribedLength) and part.points is not None
     s = 2j * np.pi * part.points
-    at_once = task.with_parts(reflex=Reflex(1.0, 0.0, TIMES[-1]))
+    at_once = task.with_parts(reflex=Reflex(1.0, 0.0, TIME))
     added = np.asarray(dynamic_stiffness(at_once, part.points)) - np.asarray(
         dynamic_stiffness(task, part.points)
     )
@@ -138,14 +139,21 @@ def planned_with_reflex(task: AbstractTask, target: Target, options: FitOptions)
 
 def starts_with_reflex(
     problem: FitProblem, known: dict[str, float], test: ReflexTest
-) -> Float[np.ndarray, "starts free"]:
-    """Starts of a fit with a reflex: the muscle as it was found, at every second delay the gain
-    that fits best there, with short and long contraction times."""
+) -> tuple[Float[np.ndarray, "starts free"], tuple[str, ...]]:
+    """Starts of a fit with a reflex, at every second delay, and how they began: with the muscle as
+    it was found and the gain that fits best beside it; and with the muscles of a fit that begins
+    anew, since without the reflex another one may have taken its place."""
     c, best = problem.coordinates, float(np.max(test.gain))
-    rows = [
-        known | dict(zip(REFLEX, (max(gain, 0.1 * best), delay, time), strict=True))
-        for delay, gain in zip(DELAYS[::2], test.gain[::2], strict=True)
-        for time in TIMES
+    tried = list(zip(DELAYS[::2], test.gain[::2], strict=True))
+    fresh = c.values_of(np.array(c.theta(starting_points(problem, 2 * len(tried)))))
+    rows = [dict(zip(c.names, row, strict=True)) for row in fresh]
+    for i, row in enumerate(rows):
+        delay, _ = tried[i % len(tried)]
+        row |= dict(zip(REFLEX, (best * (1 + 3 * (i % 2)), delay, TIME), strict=True))
+    rows += [
+        known | dict(zip(REFLEX, (max(gain, 0.1 * best), delay, TIME), strict=True))
+        for delay, gain in tried
     ]
     values = np.array([[row[name] for name in c.names] for row in rows])
-    return np.asarray(c.from_theta(c.at(values)))
+    kinds = (SPREAD,) * len(fresh) + (OTHER_MODEL,) * len(tried)
+    return np.asarray(c.from_theta(c.at(values))), kinds

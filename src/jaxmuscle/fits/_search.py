@@ -26,7 +26,6 @@ from jaxmuscle.objective._least_squares import Minima, least_squares
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.objective._residuals import Residuals
 from jaxmuscle.objective._starts import (
-    OTHER_MODEL,
     contenders,
     kinds_of_starts,
     recombined,
@@ -152,9 +151,9 @@ class _Search:
         for _ in range(1 + (models.renewed is not None)):
             plan = models.with_reflex(number, muscle)
             known = dict(zip(self.plan.problem.coordinates.names, self._values(), strict=True))
-            points = starts_with_reflex(plan.problem, known, test)
+            points, kinds = starts_with_reflex(plan.problem, known, test)
             stages: list[Stage] = []
-            plan = plan._replace(kinds=(OTHER_MODEL,) * len(points))
+            plan = plan._replace(kinds=kinds)
             reached = _descended(plan, points, stages)
             if reached is None:
                 return

@@ -18,7 +18,7 @@ class Reflex(Spelled, Inexact):
     response `t/time² exp(-t/time)`). R is the force on the active tissue [N] per lengthening [m].
     In a hold nothing is sensed. A reflex of length cannot be told from stiffness and is left to it.
 
-    **Arguments:** `gain` [N s/m], `delay` [s] >= 0, `time` [s] > 0, the contraction time.
+    **Arguments:** `gain` [N s/m] >= 0, `delay` [s] >= 0, `time` [s] > 0, the contraction time.
 
     **Raises:** `ValueError` for others.
 
@@ -30,6 +30,7 @@ class Reflex(Spelled, Inexact):
     time: Scalar = default("reflex_time")
 
     def __check_init__(self):
+        require(self.gain >= 0, f"reflex_gain = {self.gain} N s/m must not be negative")
         require(self.delay >= 0, f"reflex_delay = {self.delay} s must not be negative")
         require(
             self.time > 0,
