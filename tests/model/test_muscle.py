@@ -378,7 +378,6 @@ def test_checks_let_traced_values_through():
 
 
 def _tasks():
-    yield jm.PrescribedLength(reflex=jm.model.Reflex())
     noises = (jm.BandLimitedNoise(), jm.OrnsteinUhlenbeckNoise())
     smooth = jm.OrnsteinUhlenbeckNoise({"K_w": 0.1})
     white = jm.WhiteNoise({"K_w": 0.1, "C_w": 0.01})
@@ -387,6 +386,7 @@ def _tasks():
         *(jm.PrescribedForce(noise=noise) for noise in (*noises, jm.WhiteNoise())),
         *(jm.PrescribedMotion(noise=noise) for noise in (noises[0], smooth)),
         _with_everything(),
+        jm.PrescribedLength(reflex=jm.model.Reflex()),
     ]
 
 
