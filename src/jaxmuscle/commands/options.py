@@ -20,6 +20,12 @@ class MethodName(StrEnum):
     montecarlo = "montecarlo"
 
 
+class ReflexName(StrEnum):
+    auto = "auto"
+    none = "none"
+    linear = "linear"
+
+
 class Increments(StrEnum):
     gaussian = "gaussian"
     weak = "weak"
