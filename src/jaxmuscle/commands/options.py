@@ -150,6 +150,13 @@ Mvc = Annotated[
         ),
     ),
 ]
+Quantities = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAMES",
+        help="Quantities of a study that are compared; put commas between names.",
+    ),
+]
 Window = Annotated[
     str | None,
     typer.Option(

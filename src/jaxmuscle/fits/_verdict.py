@@ -334,7 +334,8 @@ def _worst_run(
     i = int(np.argmax(np.abs(ratio)))
     run = slice(first[i], last[i])
     low, high = frequency[run][[0, -1]]
-    place = f"at {low:.2g} Hz" if low == high else f"from {low:.2g} to {high:.2g} Hz"
+    low, high = f"{low:.2g}", f"{high:.2g}"
+    place = f"at {low} Hz" if low == high else f"from {low} to {high} Hz"
     said = (
         f"{'more' if ratio[i] > 0 else 'less'} power than the model {place} ({abs(ratio[i]):.1f}"
         " standard errors)"
