@@ -26,7 +26,7 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.fits._checks import CONVERGED
 from jaxmuscle.fits._result import RELATIVE, Estimate, FitResult, FittedPart, once
 from jaxmuscle.model._parameters import PARAMETERS
-from jaxmuscle.model._rungs import model_name
+from jaxmuscle.model._rungs import REFLEX, model_name
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._derived import MEANINGS, VARIATION
 from jaxmuscle.spectra._bin_law import ENOUGH, samples_of_trials
@@ -54,6 +54,9 @@ RHYTHMS = {
     "resonance_2_frequency": "second resonance",
     "harmonic_frequency": "regular rhythm",
     "half_power_frequency": "half-power frequency",
+    "reflex_gain": "reflex, gain",
+    "reflex_delay": "reflex, delay",
+    "reflex_time": "reflex, contraction time",
 }
 STIFFNESS = ("tangent_stiffness", "K_w_tangent", "K_z0", "C_w0", "C_z0", "m_z")
 # what a number that the data do not determine belongs to, by the beginning of its name
@@ -72,6 +75,7 @@ KINDS = {
     "corner frequency": ("corner_frequency",),
     "half-power frequency": ("half_power_frequency",),
     "regular rhythm": ("harmonic_",),
+    "stretch reflex": ("reflex_",),
     "second resonance": ("resonance_2_",),
     "resonance": ("resonance_",),
     "": ("model_", *BANDS),  # these are measured
@@ -203,7 +207,10 @@ def _judged(result: FitResult) -> list[str]:
     if not result.success:
         return [f"MODEL  {result.verdict}"]
     parts = [part for part in result.parts.values() if part.fitted.size]
-    name = " and ".join(dict.fromkeys(model_name(part.task) for part in parts)) or IN_SERIES
+    name = " and ".join(dict.fromkeys(model_name(part.task) for part in parts))
+    if not parts:
+        reflex = "reflex_gain" in result.parameters
+        name = IN_SERIES + f" + {REFLEX}" * reflex
     verdict = result.adequacy
     if verdict is None:
         return [f"MODEL  {name}: {result.verdict}"]
