@@ -255,7 +255,7 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
         assert abs(joint[name].value - true) < 4.5 * joint[name].stderr
         # more data; but each error is itself estimated
         assert joint[name].stderr < 1.02 * result[name].stderr
-    words = " ".join(str(joint).split())
+    words = " ".join(joint.details().split())
     known, fitted = joint.parts["moved"].target.stiffness.known, joint.parts["moved"].stiffness
     faint = int(np.sum(np.abs(fitted) < 2 * known.stderr))
     assert (
