@@ -16,6 +16,7 @@ from jaxmuscle.commands.options import PERTURBED, READING
 from jaxmuscle.commands.recordings import read_recordings, read_with_holds
 from jaxmuscle.data import _recording_files
 from jaxmuscle.data._as_target import as_target
+from jaxmuscle.data._perturbed import LEVER_ARM
 from jaxmuscle.fits._perturbed import recordings_of
 
 RATE, LEVEL = 200, 40.5
@@ -252,18 +253,19 @@ def test_a_joint_that_is_held_needs_no_lever_arm(tmp_path):
         np.testing.assert_allclose(hold.whole, force.whole, rtol=1e-6)
     reading = {name: default for name, (_, default) in (READING | PERTURBED).items()}
     for paths, task in (([moved], None), ([held], "prescribed-length")):
-        with pytest.raises(
-            ValueError, match="give the distance from the axis to the insertion in m"
-        ):
-            read_recordings(paths, reading, None, task)
+        (found,) = read_recordings(paths, reading, None, task)
+        assert found.of_joint
+    pulls, (hold,) = read_with_holds([moved], [held], reading, "all")
+    assert pulls[0].of_joint and hold.unit == "N"
+    np.testing.assert_allclose(hold.whole, pulls[0].at_lever_arm(LEVER_ARM).force.whole)
 
 
 @pytest.mark.parametrize(
     ("swing", "arm", "moved"),
-    [(5.0, [], False), (5.0, ["--lever-arm", 0.3], True), (0.0, [], False)],
+    [(5.0, [], True), (5.0, ["--lever-arm", 0.3], True), (0.0, [], False)],
 )
 def test_torque_beside_an_angle_that_moves(swing, arm, moved, tmp_path):
-    """As of a limb that a motor moves where the lever arm is known, else the torque alone."""
+    """As of a limb that a motor moves; where it rests, the torque alone."""
     x = force(7)
     time = np.arange(x.size) / RATE
     path = tmp_path / "joint.csv"

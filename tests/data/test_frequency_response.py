@@ -247,9 +247,9 @@ DAMAGED = {
         "frequency_hz,gain,phase,gain_N/mm\n1,2,3,4\n2,2,3,4\n",
         "are both the gain; keep one",
     ),
-    "lever arm": (
-        "frequency_hz,gain_Nm/rad,phase,coherence\n1,2,3,0.4\n2,2,3,0.4\n",
-        "give the lever arm in m",
+    "two units": (
+        "frequency_hz,gain_Nm/rad,phase,stderr_N/m\n1,2,3,0.4\n2,2,3,0.4\n",
+        "one is torque over angle, give both alike",
     ),
     "no error": (
         "frequency_hz,gain,phase\n1,2,3\n2,2,3\n",

@@ -236,7 +236,9 @@ def test_two_parts_in_series_are_not_of_second_order():
     s = 2j * np.pi * f
     inner, outer = 0.5 * s**2 + 60 * s + 200, 5 * s + 200
     exact = inner * outer / (inner + outer) + 0.5 * s**2
-    response = Response(f, exact, 0.02 * np.abs(exact), np.ones(f.size), np.eye(f.size) + 0j, f)
+    response = Response(
+        f, exact, 0.02 * np.abs(exact), np.full(f.size, 0.98), np.eye(f.size) + 0j, f, f**2
+    )
     fit = second_order_fit(response, True)
     assert f"{fit.value[0]:.0f} {fit.stderr[0]:.0f}" == "144 4"
     assert f"{1e3 * fit.value[3]:.1f} {1e3 * fit.stderr[3]:.1f}" == "-1.2 0.4"
@@ -298,6 +300,135 @@ def test_unrelated_channels_have_no_response(seconds, settings):
     assert max(related) <= 1e-3
 
 
+def joint(moved, force, **options):
+    """The recording of a joint: the same numbers in N m and, from degrees, in rad."""
+    units = {"units": "N m", "displacement_units": "deg"}
+    return recorded(np.degrees(moved), force, **units | options)
+
+
+def test_a_joint_is_described_without_a_lever_arm():
+    moved, force, _ = drawn(1, 0.2)
+    angle = 20 * moved[0]
+    turned, straight = joint(angle, force[0]), recorded(angle, force[0])
+    assert (turned.force.unit, turned.displacement.unit) == ("N m", "rad") and turned.of_joint
+    response = turned.frequency_response()
+    np.testing.assert_allclose(response.value, straight.frequency_response().value, rtol=1e-9)
+    assert response.unit == "N m/rad"
+    numbers = turned.second_order()
+    assert [m.unit for m in numbers.values()] == ["N m/rad", "N m s/rad", "kg m²"]
+    for name, true in zip("KBI", (K, B, INERTIA), strict=True):
+        assert abs(20 * numbers[name].value - true) < CHANCE * 20 * numbers[name].stderr, name
+    assert turned.second_order_of_joint() == {}
+    for arm in (0.05, 0.1):  # at a lever arm the joint's numbers stand beside, and are the same
+        given = joint(angle, force[0], lever_arm=arm)
+        np.testing.assert_allclose(given.second_order()["K"].value, numbers["K"].value / arm**2)
+        for name, one in given.second_order_of_joint().items():
+            assert (one.value, one.stderr) == pytest.approx(
+                (numbers[name].value, numbers[name].stderr), rel=1e-9
+            )
+            assert one.unit == numbers[name].unit
+        carried = turned.at_lever_arm(arm)
+        np.testing.assert_allclose(carried.force.whole, given.force.whole)
+        np.testing.assert_allclose(carried.displacement.whole, given.displacement.whole, atol=1e-15)
+    assert "torque [N m] and lengthening [rad]" in str(turned) and "deg rms" in str(turned)
+    labels = {ax.get_ylabel() for ax in turned.plot().axes}
+    assert {"Torque (N m)", "Angle (deg)", "Gain (N m/rad)"} <= labels
+    with pytest.raises(ValueError, match="only a torque has a lever arm"):
+        straight.at_lever_arm(0.1)
+    (size,) = joint(np.radians(angle), force[0]).notices
+    assert size.endswith("give --displacement-units rad (Python: displacement_units=)")
+
+
+def test_a_joint_as_a_file(tmp_path):
+    moved, force, _ = drawn(1, 0.2)
+    path, out = tmp_path / "ankle.csv", tmp_path / "out"
+    save(path, time=np.arange(6000) / 100, torque_Nm=force[0] / 10, angle_rad=20 * moved[0])
+    code, text = analyse(path, "--out", out)
+    assert code == 0, text
+    found = json.loads((out / "analysis.json").read_text())
+    numbers = found["second_order"]
+    assert [numbers[name]["unit"] for name in "KBI"] == ["N m/rad", "N m s/rad", "kg m²"]
+    for name, true in zip("KBI", (K, B, INERTIA), strict=True):
+        error = numbers[name]["value"] - true / 200
+        assert abs(error) < CHANCE * numbers[name]["stderr"], name
+    assert "describe the points" in text and found["second_order_misfit"]["p"] > 0.01
+    assert "second_order_of_joint" not in found and found["passive"]["notices"] == []
+    again = jm.data.load_frequency_response(out / "response.csv")
+    table = jm.data.FrequencyResponse.from_table(found["response"])
+    assert again.unit == table.unit == "N m/rad"
+    np.testing.assert_allclose(again.value, table.value)
+    at_arm = jm.data.load_frequency_response(out / "response.csv", lever_arm=0.1)
+    np.testing.assert_allclose(at_arm.value, 100 * table.value)
+    code, text = analyse(path, "--out", out, "--force", "--lever-arm", 0.1)
+    beside = json.loads((out / "analysis.json").read_text())
+    assert code == 0 and beside["second_order"]["K"]["unit"] == "N/m"
+    for name in "KBI":
+        assert list(beside["second_order_of_joint"][name].values())[:2] == pytest.approx(
+            list(numbers[name].values())[:2], rel=1e-9
+        )
+
+
+def test_the_band_of_the_response(tmp_path):
+    """By default as far as the motion excites, at most to 30 Hz; the spectrum has its own bins."""
+    rng = np.random.default_rng(2)
+    x = 1e-3 * rng.standard_normal(12_000)
+    force = MEAN + K * x + 0.3 * rng.standard_normal(x.size)
+    wide = recorded(x, force, 200.0)
+    assert wide.frequency_response().frequency[[0, -1]] == pytest.approx([0.39, 30], abs=0.4)
+    assert recorded(x, force, 50.0).frequency_response().frequency[-1] <= 20
+    narrow = recorded(x, force, 200.0, band=(2, 10))
+    assert narrow.frequency_response("slow").frequency[[0, -1]] == pytest.approx([2, 10])
+    target = narrow.target()
+    first, *_, last = target.stiffness.frequency  # groups are up to 12 % wide
+    assert 2 <= first < 2 * 1.12**2 and 10 / 1.12 < last < 10 * 1.12
+    assert len(target.bins) == 30
+    assert wide.target().stiffness.frequency[-1] > 28
+    within, _, _ = drawn(1, 0.2)
+    still = recorded(within[0], force[: within[0].size])
+    assert still.frequency_response().frequency[-1] < 25  # nothing moves above
+    for band in ((5, 2), (1, 60), "x"):
+        with pytest.raises(ValueError, match="give lowest and highest frequency"):
+            recorded(x, force, 200.0, band=band)
+    path = save(tmp_path / "x.csv", time=np.arange(12_000) / 200, force_N=force, x_m=x)
+    named = ["--force-column", "force_N", "--displacement", "x_m", "--out", tmp_path / "out"]
+    assert analyse(path, *named, "--band", "2:10")[0] == 0
+    found = json.loads((tmp_path / "out" / "analysis.json").read_text())
+    assert 2 <= found["response"]["frequency_hz"][0] < found["response"]["frequency_hz"][-1] <= 10
+    code, text = analyse(path, *named, "--force", "--band", "10")
+    assert code == 2 and "--band 10: give lowest and highest" in text
+
+
+def test_p_of_the_shape_is_right(responses):
+    """Uniform where a spring, a damper and a mass are the truth."""
+    recordings, _, _ = responses
+    p = [recording.second_order_misfit()[1] for recording in recordings]
+    assert scipy.stats.kstest(p, "uniform").pvalue > 1e-4
+    assert np.mean(np.array(p) < 0.05) < 0.2
+
+
+def test_what_is_not_passive_is_seen():
+    """A spring whose force is late; not one whose force is in time, though it does not damp."""
+    moved, _, _ = drawn(40, 0.2, rate=1000.0)
+    rng = np.random.default_rng(6)
+    p, notices = [], []
+    for x in moved:
+        noise = scipy.signal.lfilter([0.06], [1, -0.99], rng.standard_normal(x.size))
+        exact = recorded(x, MEAN + K * x + noise, 1000.0, positive="lengthening")
+        p.append(exact.frequency_response().p_passive[0])
+        notices += exact.frequency_response().activity
+    # each below 0.01 with a probability of at most 0.01: five of 40 by one chance in 20 000
+    assert len(notices) < 5 and np.sum(np.array(p) < 0.05) < 9
+    x, noise = moved[0], 0.1 * rng.standard_normal(moved[0].size)
+    late = recorded(x[30:], (MEAN + K * x + noise)[:-30], 1000.0, positive="lengthening")
+    (said,) = late.frequency_response().activity
+    assert "the imaginary part of the stiffness is negative" in said
+    assert "a force channel that is late looks the same" in said
+    assert said in late.target().notices
+    heavy = MEAN + 3.0 * np.gradient(np.gradient(x, 1e-3), 1e-3) + noise
+    early = recorded(x[:-10], heavy[10:], 1000.0, positive="lengthening")
+    assert "a displacement channel that is late" in early.frequency_response().activity[0]
+
+
 def test_sign():
     moved, force, _ = drawn(1, 0.2)
     straight, turned = recorded(moved[0], force[0]), recorded(-moved[0], force[0])
@@ -313,8 +444,11 @@ def test_sign():
     # above 2.3 Hz a mass
     heavy = force[0] + (7.5 - INERTIA) * np.gradient(np.gradient(moved[0], 1 / RATE), 1 / RATE)
     np.testing.assert_array_equal(recorded(moved[0], heavy).displacement.whole, moved[0])
-    (pushed,) = recorded(moved[0], -force[0]).notices
-    assert "mean force is negative" in pushed and "It will not be once the force is right" in pushed
+    for sign in (1, -1):  # a negative pull is turned, then the lengthening is found as before
+        pushed = recorded(sign * moved[0], -force[0])
+        np.testing.assert_array_equal(pushed.force.whole, force[0])
+        np.testing.assert_array_equal(pushed.displacement.whole, moved[0])
+        assert noticed(pushed, "the mean force is negative: its sign is turned")
     stated = recorded(-moved[0], -force[0], positive="lengthening").notices
     assert any("mean force is negative" in notice and "turned" not in notice for notice in stated)
     for factor, unit in ((1e3, "mm"), (1e-3, "m")):  # the column's unit is another one than it says
@@ -348,6 +482,34 @@ def test_steady_part_and_window():
         ValueError, match=r"a frequency response needs 512 at 100 Hz, 5\.12 s; give a longer window"
     ):
         whole.steady((10, 14)).frequency_response()
+
+
+def test_the_hold_of_a_force_that_answers_as_no_spring_does():
+    """An answer that comes 60 ms late and drifts, of 40 % of the force; a joint without a force."""
+    moved, *_ = drawn(1, 0.05)
+    x, still = moved[0], np.zeros(500)
+    late = np.concatenate([np.zeros(6), x[:-6]])
+    slow = scipy.signal.lfilter([0.02], [1, -0.98], np.random.default_rng(3).normal(size=x.size))
+    slow *= 0.15 / slow.std()
+    for weak in (3.0, 0.0):
+        answer = weak * slow + (0.7 * late + 0.7 * np.roll(late, 40)) / np.std(x)
+        ramp = np.linspace(0, weak, 500)
+        noise = 0.01 * np.random.default_rng(4).standard_normal(x.size + 1000)
+        whole = recorded(
+            np.concatenate([still, x, still]),
+            noise + np.concatenate([ramp, weak + answer, ramp[::-1]]),
+            positive="lengthening",
+        )
+        held = whole.steady()
+        assert held.window is not None and held.force.window == held.displacement.window
+        a, b = held.window
+        assert 4.9 < a < b < 65.1 and b - a > 45
+        assert noticed(held, "where the insertion moves")
+        kind = "within half of its level" if weak else "having no level of its own"
+        assert noticed(held, kind)
+    ramped = recorded(np.concatenate([still, x, still]), np.linspace(0, 50, x.size + 1000) ** 2)
+    with pytest.raises(ValueError, match="no steady part was found"):
+        ramped.steady()
 
 
 def test_the_hold_of_a_weak_force_that_answers_with_half_of_itself():

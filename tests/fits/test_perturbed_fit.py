@@ -17,8 +17,10 @@ from scipy.optimize import brentq
 import jaxmuscle as jm
 from jaxmuscle.fits._perturbed import alike, seen_with, without_rhythm
 from jaxmuscle.fits._verdict import Endpoint
+from jaxmuscle.objective._arguments import at_mean
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._options import FitOptions
+from jaxmuscle.objective._two_tissues import two_tissues
 from jaxmuscle.uncertainty import _posterior
 from jaxmuscle.uncertainty._chains import Chains
 from jaxmuscle.uncertainty._identifiability import fitted_problem
@@ -601,3 +603,105 @@ def test_a_hold_beside_it_is_of_the_same_masses(minute, result):
     for name, true in WHOLE.items():
         assert abs(both[name].value - true) < 3.9 * both[name].stderr, name
         assert both[name].stderr < 1.1 * result[name].stderr, name
+
+
+def ankle(f):
+    """Two tissues in series about a joint, with their masses in kg m², by the equations of
+    docs/perturbed.md."""
+    s = 2j * np.pi * f
+    outer = 90.0 + 0.3 * s
+    inner = 120.0 + 4.0 * s + 0.01 * s**2
+    return 0.012 * s**2 + outer - outer**2 / (inner + outer)
+
+
+def test_the_numbers_of_a_joint_do_not_depend_on_the_lever_arm():
+    """Nor do the errors; and they are those of the joint, though its mass is twenty times that of
+    the model's limb."""
+    f = np.geomspace(0.5, 30, POINTS)
+    exact = ankle(f)
+    error = 0.02 * np.abs(exact)
+    rng = np.random.default_rng(4)
+    noise = rng.standard_normal((2, POINTS)).T @ np.array([1, 1j])
+    response = jm.data.FrequencyResponse(f, exact + error * noise, error, unit="N m/rad")
+    found = {}
+    with without_intervals():
+        for arm in (None, 0.05, 0.1):
+            given = response if arm is None else response.at_lever_arm(arm)
+            result = jm.fit(jm.PrescribedLength(), given)
+            assert result.success and result.adequate
+            square = (arm or 0.05) ** 2
+            found[arm] = {
+                n: (square * result[n].value, square * (result[n].stderr or np.inf))
+                for n in ("K_w_tangent", "K_z0", "tangent_stiffness", "C_z0", "m_z")
+            }
+            words = str(result)
+            assert f"About the axis of the joint (those in N and m are at {arm or 0.05} m" in words
+            assert "N m/rad" in words and "kg m²" in words
+    true = {
+        "K_w_tangent": 120.0,
+        "K_z0": 90.0,
+        "tangent_stiffness": 120 * 90 / 210,
+        "C_z0": 0.3,
+        "m_z": 0.012,
+    }
+    for name, one in found[None].items():
+        for arm in (0.05, 0.1):
+            assert abs(found[arm][name][0] - one[0]) < 0.1 * one[1], name
+            assert found[arm][name][1] == pytest.approx(one[1], rel=0.1)
+        assert abs(one[0] - true[name]) < 4 * one[1], name
+
+
+def test_two_tissues_are_found_from_the_response_itself():
+    """Twenty times as heavy and a thousand times as stiff as the default muscle."""
+    f = np.geomspace(0.5, 30, 60)
+    exact = ankle(f)
+    response = jm.data.FrequencyResponse(f, exact, 1e-3 * np.abs(exact), unit="N m/rad")
+    found = two_tissues(response.at_lever_arm(0.05))
+    true = {"m_w": 0.01, "m_z": 0.012, "K_w": 120.0, "K_z": 90.0, "C_w": 4.0, "C_z": 0.3}
+    for name, value in true.items():
+        assert 0.05**2 * found[name] == pytest.approx(value, rel=1e-3), name
+
+
+def test_what_cannot_be_simulated_has_a_response_all_the_same(minute, monkeypatch):
+    def stiff(*_):
+        raise ValueError("this task has an eigenvalue of 1e+09/s")
+
+    monkeypatch.setattr("jaxmuscle.fits._report._simulated", stiff)
+    quick = {"starts": 8, "seeds": 0, "check_seeds": 8, "rungs": 0}
+    with without_intervals():
+        found = jm.fit(jm.PrescribedLength(), minute, **quick)
+    assert found.success and found.adequate
+    assert "cannot be simulated (this task has an eigenvalue of 1e+09/s)" in found.notices[0]
+    assert abs(found["K_z0"].value - WHOLE["K_z0"]) < 4 * found["K_z0"].stderr
+    assert np.all(np.isfinite(found.stiffness))
+
+
+def test_the_prior_of_a_joint_is_carried_by_the_lever_arm():
+    """Centres in N m/rad, N m s/rad and kg m² are the same at any lever arm, and those of the
+    response; so they are where the force varies by more than its mean."""
+    f = np.geomspace(0.5, 30, 60)
+    h = 45.0 + 0.9 * 2j * np.pi * f - 0.015 * (2 * np.pi * f) ** 2
+    joint = jm.data.FrequencyResponse(f, h, 1e-3 * np.abs(h), unit="N m/rad")
+    spectrum = jm.data.load_target("vastus-lateralis-26mvc").proportional_power
+    base = jm.PrescribedLength()
+    for arm in (0.05, 0.1):
+        response = joint.at_lever_arm(arm)
+        for mean, varies in ((12.0, 0.02), (0.1, None)):
+            target = jm.Target(
+                "ankle",
+                spectrum,
+                quantity="force",
+                unit="N",
+                mean=[mean / arm],
+                segments=[40],
+                coefficient_of_variation=None if varies is None else [varies],
+                stiffness=response,
+            )
+            task, options = at_mean(base, target, FitOptions())
+            k_w, k_z, *_ = task.muscle.base()
+            assert arm**2 * k_w * k_z / (k_w + k_z) == pytest.approx(45.0, rel=1e-3)
+            assert arm**2 * float(task["m_z"]) == pytest.approx(0.015, rel=1e-3)
+            assert float(task["x_ref_w"]) == pytest.approx(0.02 * arm / 0.05)
+            ratio = [float(t["C_w0"]) ** 2 / float(t["K_w0"] * t["m_w"]) for t in (task, base)]
+            assert ratio[0] == pytest.approx(ratio[1])
+            assert (options.mean_force is None) == (varies is None)

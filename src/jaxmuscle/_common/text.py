@@ -34,7 +34,8 @@ def rounded(value: float, error: float) -> tuple[str, str]:
         places -= 1
     if not -4 <= places <= 7:
         return digits(value), digits(error, 2)
-    shown = [f"{round(x, places):.{max(places, 0)}f}" for x in (value, error)]
+    # + 0: no -0.00
+    shown = [f"{round(x, places) + 0.0:.{max(places, 0)}f}" for x in (value, error)]
     return shown[0], shown[1]
 
 

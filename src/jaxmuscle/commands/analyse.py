@@ -44,10 +44,13 @@ from .recordings import (
 )
 
 if TYPE_CHECKING:
-    from jaxmuscle.data import PerturbedRecording, Trials
+    from jaxmuscle.data import Measure, PerturbedRecording, Trials
 
 FITTED = ("force", "torque", "displacement", "acceleration")
-VAGUE, MISSED = 0.05, 2.0  # s, standard error of a delay that is none; chi² over its expectation
+VAGUE = 0.05  # s, standard error of a delay that is none
+# p below which K, B and I do not describe the points; chi² over its expectation, from which on
+# they do not even nearly
+UNLIKELY, MISSED = 0.01, 2.0
 
 
 @reads_perturbed
@@ -86,9 +89,10 @@ def analyse(
     Writes DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
 
     Of a limb that a motor moved you get the dynamic stiffness instead, with stiffness K, damping B
-    and mass I, in DIR/analysis.json, DIR/response.csv and DIR/analysis.png. The columns of force
-    and displacement are found, or named with --force-column and --displacement. --column NAME
-    analyses the force alone.
+    and mass I, in DIR/analysis.json, DIR/response.csv and DIR/analysis.png. A joint with torque and
+    angle has them in N m/rad, N m s/rad and kg m². With --lever-arm they are in N/m, N s/m and kg,
+    and those of the joint stand beside. The columns of force and displacement are found, or named
+    with --force-column and --displacement. --column NAME analyses the force alone.
 
     Examples:
 
@@ -256,23 +260,32 @@ def _write_perturbed(
     from jaxmuscle._common.files import write_json
     from jaxmuscle._common.text import rounded
 
-    response, delay = recording.frequency_response(settings), recording.delay(settings)
-    classical = {
-        name: (m.value, float(m.stderr or 0.0), m.unit)
-        for name, m in recording.second_order(settings).items()
+    response, (delay, vague) = recording.frequency_response(settings), recording.delay(settings)
+    classical, (misfit, p) = (
+        recording.second_order(settings),
+        recording.second_order_misfit(settings),
+    )
+    numbers = {
+        name: {"value": m.value, "stderr": m.stderr, "unit": m.unit}
+        for name, m in classical.items()
     }
-    classical["delay"], misfit = (*delay, "s"), recording.second_order_misfit(settings)
+    numbers["delay"] = {"value": delay, "stderr": vague, "unit": "s"}
+    beside = recording.second_order_of_joint(settings)
     figures = write_figure(recording.plot(settings), folder, "analysis", formats)
     response.save(folder / "response.csv")
     names = ("name", "source", "rate", "window", "notices")
     found = {
         "recording": {key: getattr(recording, key) for key in names},
         "response": response.to_table(),
-        "second_order": {
-            name: dict(zip(("value", "stderr", "unit"), row, strict=True))
-            for name, row in classical.items()
-        },
+        "second_order": numbers,
+        "second_order_misfit": {"chi2_over_expected": misfit, "p": p},
+        "passive": {"p": response.known.p_passive[0], "notices": list(response.activity)},
     }
+    if beside:
+        found["second_order_of_joint"] = {
+            name: {"value": m.value, "stderr": m.stderr, "unit": m.unit}
+            for name, m in beside.items()
+        }
     write_json(folder / "analysis.json", found)
     out.print(plain_lines(recording))
     for line in str(response).splitlines():
@@ -280,25 +293,35 @@ def _write_perturbed(
             out.print(plain(line))
     title = "Spring K, damper B, mass I:\nH = K + iωB - ω²I\n(the delay is of a second fit)"
     table = Table(title=title, title_justify="left", show_header=False)
-    for name, (value, error, unit) in classical.items():
-        told = (" ± ".join(rounded(value, error)), unit)
-        table.add_row(
-            name,
-            *(
-                told
-                if name != "delay" or error < VAGUE
-                else ("not determined by this response", "")
-            ),
-        )
+    for name, m in classical.items():
+        table.add_row(name, *(cell for one in (m, beside.get(name)) if one for cell in _told(one)))
+    told = " ± ".join(rounded(1e3 * delay, 1e3 * vague)), "ms"
+    table.add_row("delay", *(told if vague < VAGUE else ("not determined by this response", "")))
     out.print(table)
-    late = recording.late(settings)
-    for notice in late:
+    out.print(_described(misfit, p), soft_wrap=True)
+    for notice in recording.late(settings):
         say_notice(notice)
-    if misfit > MISSED and not late:
-        out.print(
-            "A spring, a damper and a mass do not describe these points: their chi2 is"
-            f" {misfit:.2g} times what it should be. Do not interpret K, B and I. Fit a muscle:"
-            " jaxmuscle fit FILE --task prescribed-length",
-        )
     record(found)
     say_written(folder, "analysis.json", "response.csv", *figures)
+
+
+def _told(measure: "Measure") -> tuple[str, str]:
+    return measure.in_words(), measure.unit
+
+
+def _described(misfit: float, p: float) -> str:
+    """Whether a spring, a damper and a mass are the shape of the response."""
+    from jaxmuscle._common.text import probability
+
+    sizes = f"chi² is {misfit:.2g} times its expectation, {probability(p)}"
+    if p >= UNLIKELY:
+        return f"Spring, damper and mass describe the points: {sizes}."
+    if misfit <= MISSED:
+        return (
+            f"Spring, damper and mass describe the points nearly: {sizes}. The errors of K, B and I"
+            " contain that."
+        )
+    return (
+        f"Spring, damper and mass do not describe the points: {sizes}. Do not interpret K, B and I."
+        " Fit a muscle: jaxmuscle fit FILE --task prescribed-length"
+    )

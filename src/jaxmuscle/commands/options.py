@@ -350,6 +350,19 @@ PERTURBED: dict[str, tuple[Any, Any]] = {  # the same for a file of force and di
         ],
         0.0,
     ),
+    "band": (
+        Annotated[
+            str | None,
+            typer.Option(
+                metavar="LOW:HIGH",
+                help=(
+                    "For a moved insertion: the band of the response in Hz; by default as far as"
+                    " the motor moves it, at most to 30 Hz."
+                ),
+            ),
+        ],
+        None,
+    ),
 }
 SAME_NAME = (
     *READING,

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 import jaxmuscle as jm
 from jaxmuscle._common.inputs import looked_at
 from jaxmuscle._common.units import NEWTONS
+from jaxmuscle.data._perturbed import LEVER_ARM
+from jaxmuscle.data._recording_table import measured_in
 
 from .console import say_notice
-from .options import PERTURBED, READING
+from .options import PERTURBED, READING, band_of
 
 if TYPE_CHECKING:
     from jaxmuscle.data import PerturbedRecording, Table, Trials
@@ -90,7 +92,8 @@ def moved_by_motor(paths: Sequence[str], reading: dict[str, Any]) -> bool:
             continue
         if not found or (moves := jm.data.movement(table, found["displacement"])).rests:
             continue
-        if moves.unit == "deg" and reading["lever_arm"] is None:  # torque and angle have a notice
+        of_torque = measured_in(table, found["force"]) == "torque"
+        if (moves.unit == "deg") != of_torque and reading["lever_arm"] is None:  # has a notice
             continue
         say_notice(
             f"{found['displacement']} moves by {moves}, so the recording is treated as one of a"
@@ -166,6 +169,8 @@ def read_with_holds(
                 " first, --hold takes the holds"
             )
     moved = read_perturbed(tables, reading, windows[: len(tables)])
+    if moved[0].of_joint:
+        reading = reading | {"lever_arm": LEVER_ARM}
     held = jm.data.Trials(
         [
             _hold(table, reading, edges)
@@ -222,6 +227,8 @@ def read_perturbed(
         for name, value in reading.items()
         if name not in ("force_column", "displacement")
     }
+    if options["band"] is not None:
+        options["band"] = band_of(options["band"])
     named = {"force": reading["force_column"], "displacement": reading["displacement"]}
     each = zip(tables_of(paths, reading), windows, strict=True)
     return [

@@ -8,9 +8,9 @@ from typing import Any
 from jaxmuscle._common.errors import TargetError
 
 from ._file_kinds import are_recordings, kind_of_file
-from ._frequency_response import FrequencyResponse
+from ._frequency_response import JOINT, FrequencyResponse
 from ._frequency_response_files import load_frequency_response
-from ._perturbed import PerturbedRecording
+from ._perturbed import LEVER_ARM, PerturbedRecording
 from ._recording import Recording
 from ._target import Target, load_target
 from ._trials import Trials, load_recordings
@@ -73,6 +73,7 @@ def as_target(
     if isinstance(given, Target):
         return given
     if isinstance(given, FrequencyResponse):
+        given = given.at_lever_arm(LEVER_ARM) if given.unit == JOINT else given
         return Target(given.name, None, source=given.source, stiffness=given, notices=given.notices)
     if isinstance(given, Recording | Trials | PerturbedRecording):
         return given.target()

@@ -3,7 +3,7 @@ errors."""
 
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Unpack
 
@@ -17,10 +17,10 @@ from jaxmuscle._common.arguments import check_options, require
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.documents import Table, checked, says
 from jaxmuscle._common.files import write_text
-from jaxmuscle._common.text import probability
+from jaxmuscle._common.text import probability, rounded
 
 from ._recording_choice import Origin
-from ._second_order import parts, second_order_shape
+from ._second_order import averages_of, parts, second_order_shape, shortened
 from ._target_fields import frozen
 
 Numbers = list[float]
@@ -32,6 +32,8 @@ HEADER = re.compile(
     r"(frequency|freq|f|gain|phase|coherence|stderr)(?:[ _/]*[\[(]?([^\[\]()]*?)[\])]?)"
 )
 COLUMNS = ("frequency_hz", "gain_N/m", "phase_deg", "stderr_N/m", "coherence")
+JOINT = "N m/rad"
+IMPASSIVE = 0.01  # how probable a negative imaginary part may be at most, to be said
 
 
 class ResponseTable(Table, kw_only=True):
@@ -52,6 +54,14 @@ class ResponseTable(Table, kw_only=True):
     coherence: Annotated[Numbers | None, says("Squared coherence, 0 to 1", missing="unknown")] = (
         None
     )
+    unit: Annotated[
+        Literal["N/m", "N m/rad"],
+        says("Of real, imaginary and stderr: N m/rad of a joint", missing="N/m"),
+    ] = "N/m"
+    lever_arm: Annotated[
+        float | None,
+        says("From the axis [m], where they were made of torque and angle", missing="unknown"),
+    ] = None
 
 
 class FrequencyResponse(Shown, eqx.Module):
@@ -71,6 +81,8 @@ class FrequencyResponse(Shown, eqx.Module):
     - `coherence`, shape `(bins,)`: the share of the force's power that follows the displacement, 0
       to 1; or `None`.
     - `name`, `source`, `notices`: how reports call it, where it comes from, what was done to it.
+    - `unit`: of `value` and `stderr`; "N m/rad" of a joint, torque over angle.
+    - `lever_arm` [m]: with which a response in N/m was made of torque and angle.
 
     **Raises:** `ValueError` naming the argument, the entry and the remedy.
     """
@@ -82,6 +94,8 @@ class FrequencyResponse(Shown, eqx.Module):
     name: str = eqx.field(static=True)
     source: str = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
+    unit: str = eqx.field(static=True)
+    lever_arm: float | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -90,10 +104,11 @@ class FrequencyResponse(Shown, eqx.Module):
         stderr: Any,
         coherence: Any = None,
         *,
-        name: str = "response",
-        source: str = "given by the user",
-        notices: Iterable[str] = (),
+        unit: str = "N/m",
+        lever_arm: float | None = None,
+        **words: Unpack[Origin],
     ):
+        check_options(FrequencyResponse, Origin, words)
         rising = "give rising frequencies above 0 Hz, each once"
         self.frequency = _column("frequency", frequency, None, _rises, rising)
         size = self.frequency.size
@@ -108,7 +123,11 @@ class FrequencyResponse(Shown, eqx.Module):
             if coherence is None
             else _column("coherence", coherence, size, lambda x: (x >= 0) & (x <= 1), SQUARED)
         )
-        self.name, self.source, self.notices = name, source, tuple(notices)
+        self.name = words.get("name", "response")
+        self.source = words.get("source", "given by the user")
+        self.notices = tuple(words.get("notices", ()))
+        require(unit in ("N/m", JOINT), "unit", unit, f"give N/m or {JOINT}")
+        self.unit, self.lever_arm = unit, lever_arm
 
     @classmethod
     def from_gain(
@@ -120,6 +139,8 @@ class FrequencyResponse(Shown, eqx.Module):
         coherence: Any = None,
         segments: Any = None,
         stderr: Any = None,
+        unit: str = "N/m",
+        lever_arm: float | None = None,
         **words: Unpack[Origin],
     ) -> "FrequencyResponse":
         """A response as figures show it: gain, phase and coherence.
@@ -136,7 +157,7 @@ class FrequencyResponse(Shown, eqx.Module):
         - `coherence` γ²
         - `segments`: K, one number or one for each frequency
         - `stderr` [N/m]
-        - `words`: `name`, `source`, `notices`, as in `FrequencyResponse`
+        - `unit`, `lever_arm`, and `words` (`name`, `source`, `notices`), as in `FrequencyResponse`
 
         **Raises:** `ValueError` without `stderr` and without (`coherence` and `segments`), and as
         `FrequencyResponse` does.
@@ -163,7 +184,19 @@ class FrequencyResponse(Shown, eqx.Module):
             with np.errstate(divide="ignore"):
                 stderr = gain * np.sqrt((1 - shared) / (2 * averages * shared))
         value = gain * np.exp(1j * np.radians(phase))
-        return cls(frequency, value, stderr, coherence, **words)
+        return cls(frequency, value, stderr, coherence, unit=unit, lever_arm=lever_arm, **words)
+
+    def at_lever_arm(self, arm: float) -> "FrequencyResponse":
+        """The response of a joint as force over displacement at a distance [m] from its axis."""
+        require(self.unit == JOINT, "unit", self.unit, f"only one in {JOINT} has a lever arm")
+        remedy = "give a distance above 0 m"
+        require(0 < arm < np.inf, "arm", arm, remedy)
+        return self._with(
+            value=self.value / arm**2, stderr=self.stderr / arm**2, unit="N/m", lever_arm=float(arm)
+        )
+
+    def _with(self, **changed: Any) -> "FrequencyResponse":
+        return FrequencyResponse(**{**vars(self), **changed})
 
     @property
     def known(self) -> "FrequencyResponse":
@@ -171,9 +204,9 @@ class FrequencyResponse(Shown, eqx.Module):
         kept = np.isfinite(self.stderr)
         if np.all(kept):
             return self
-        arrays = (self.frequency, self.value, self.stderr, self.coherence)
-        part = (None if array is None else array[kept] for array in arrays)
-        return FrequencyResponse(*part, name=self.name, source=self.source, notices=self.notices)
+        names = ("frequency", "value", "stderr", "coherence")
+        arrays = {name: getattr(self, name) for name in names}
+        return self._with(**{n: None if a is None else a[kept] for n, a in arrays.items()})
 
     @property
     def gain(self) -> Bins:
@@ -196,8 +229,7 @@ class FrequencyResponse(Shown, eqx.Module):
         stderr²); or `None`."""
         if self.coherence is None:
             return None
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return (1 - self.coherence) / (2 * self.coherence) * (self.gain / self.stderr) ** 2
+        return averages_of(self.value, self.stderr, self.coherence)
 
     @property
     def p_none(self) -> float:
@@ -224,9 +256,7 @@ class FrequencyResponse(Shown, eqx.Module):
         size = (np.abs(one.value) / one.stderr) ** 2
         squares = size
         if one.averages is not None:
-            # fewer than one average and a bit would be divided by nothing
-            spare, shared = np.maximum(2 * (one.averages - 1), 1e-3), (1.4, 1.9)
-            squares = spare * np.log1p(size / spare)
+            squares, shared = shortened(size, one.averages), (1.4, 1.9)
         weight = np.tile(np.sqrt(squares / size) / one.stderr, 2)
         shapes = [
             parts(second_order_shape(one.frequency, unit)) / np.tile(one.stderr, 2)
@@ -240,6 +270,54 @@ class FrequencyResponse(Shown, eqx.Module):
         )
         return float(min(1.0, 2 * p.min()))
 
+    @property
+    def spring_and_mass(self) -> tuple[float, float]:
+        """K [N/m] and I [kg] of K + iωB - ω²I, none of them negative, by weighted least squares.
+        Neither is less than a twentieth of what else answers."""
+        one = self.known
+        error, turn = np.tile(one.stderr, 2), 2 * np.pi * one.frequency.max()
+        scale = one.gain.max() / turn ** np.arange(3)
+        shapes = [
+            parts(second_order_shape(one.frequency, unit * scale)) / error for unit in np.eye(3)
+        ]
+        found = scipy.optimize.nnls(np.stack(shapes, axis=1), parts(one.value) / error)[0]
+        k, _, i = np.maximum(found, 0.05 * found.sum()) * scale
+        return float(k), float(i)
+
+    @property
+    def p_passive(self) -> tuple[float, int]:
+        """How probable it is that a passive limb shows an imaginary part as negative as the most
+        negative one, and which entry that is.
+
+        What is passive takes up energy: Im H(f) >= 0. The probability of Im H / stderr is that of
+        Student's t with 2 (n - 1) degrees of freedom for `averages` n, of the normal distribution
+        without a coherence. It is multiplied by the number of frequencies, since the least of all
+        is taken.
+        """
+        size = np.imag(self.value) / self.stderr
+        averages = self.averages
+        free = np.inf if averages is None else np.maximum(2 * (averages - 1), 1.0)
+        p = scipy.stats.t.cdf(size, free)
+        return float(min(1.0, p.size * np.min(p))), int(np.argmin(p))
+
+    @property
+    def activity(self) -> tuple[str, ...]:
+        """A notice if the imaginary part is surely negative, else nothing."""
+        one = self.known
+        p, i = one.p_passive
+        if p > IMPASSIVE:
+            return ()
+        late = "force" if np.real(one.value[i]) > 0 else "displacement"
+        said = "p < 1e-6" if p < 1e-6 else f"p = {p:.1g}"
+        least = " ± ".join(rounded(np.imag(one.value[i]), one.stderr[i]))
+        return (
+            f"the imaginary part of the stiffness is negative: {least} {self.unit} at"
+            f" {one.frequency[i]:.3g} Hz ({said}, {one.frequency.size} frequencies being looked"
+            " at). A passive limb, whatever it is made of, takes up energy and cannot do that. A"
+            f" reflex can. But a {late} channel that is late looks the same, and so does a rig that"
+            " bends between the two sensors: exclude these first",
+        )
+
     def to_table(self) -> dict[str, Any]:
         """The response as plain lists, for TOML and JSON; an infinite error is the text "inf"."""
         table: dict[str, Any] = {
@@ -251,7 +329,9 @@ class FrequencyResponse(Shown, eqx.Module):
             "imaginary": np.imag(self.value).tolist(),
             "stderr": [e if np.isfinite(e) else "inf" for e in self.stderr.tolist()],
         }
-        return table | ({} if self.coherence is None else {"coherence": self.coherence.tolist()})
+        table |= {} if self.coherence is None else {"coherence": self.coherence.tolist()}
+        table |= {} if self.unit == "N/m" else {"unit": self.unit}
+        return table | ({} if self.lever_arm is None else {"lever_arm": self.lever_arm})
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> "FrequencyResponse":
@@ -262,7 +342,8 @@ class FrequencyResponse(Shown, eqx.Module):
         equal = len(said.imaginary) == count
         require(equal, "imaginary", len(said.imaginary), f"give {count} numbers, as in real")
         value = np.asarray(said.real, float) + 1j * np.asarray(said.imaginary, float)
-        words = {"name": said.name, "source": said.source, "notices": said.notices}
+        names = ("name", "source", "notices", "unit", "lever_arm")
+        words = {name: getattr(said, name) for name in names}
         stderr = np.array(said.stderr, float)
         return cls(said.frequency_hz, value, stderr, said.coherence, **words)
 
@@ -283,8 +364,13 @@ class FrequencyResponse(Shown, eqx.Module):
         columns += [] if self.coherence is None else [self.coherence]
         rows = [",".join(map(repr, row)) for row in np.stack(columns, axis=1).tolist()]
         write_text(
-            path, "\n".join([f"# {self.source}", ",".join(COLUMNS[: len(columns)]), *rows]) + "\n"
+            path,
+            "\n".join([f"# {self.source}", self._header(len(columns)), *rows]) + "\n",
         )
+
+    def _header(self, columns: int) -> str:
+        unit = self.unit.replace(" ", "")
+        return ",".join(COLUMNS[:columns]).replace("N/m", unit)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw gain, phase and coherence with their errors, see
@@ -296,7 +382,11 @@ class FrequencyResponse(Shown, eqx.Module):
         error = f"{100 * np.median(self.stderr / gain):.2g} %"
         known = [
             ("source", self.source),
-            ("gain", f"{gain.min():.4g} to {gain.max():.4g} N/m, standard error {error} (median)"),
+            (
+                "gain",
+                f"{gain.min():.4g} to {gain.max():.4g} {self.unit}, standard error {error}"
+                " (median)",
+            ),
             ("phase", f"{phase.min():.0f} to {phase.max():.0f} deg"),
         ]
         if shared is not None:
@@ -310,7 +400,7 @@ class FrequencyResponse(Shown, eqx.Module):
         notices = (*((unseen,) if self.p_none > UNSEEN else ()), *self.notices)
         known += [("notice", notice) for notice in notices]
         span = f"{f.size} frequencies from {f[0]:.3g} to {f[-1]:.3g} Hz"
-        return facts(f"{self.name}: dynamic stiffness [N/m], {span}", known, width=9)
+        return facts(f"{self.name}: dynamic stiffness [{self.unit}], {span}", known, width=9)
 
 
 def check_seen(response: FrequencyResponse, whose: str) -> None:

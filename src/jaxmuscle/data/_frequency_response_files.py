@@ -12,7 +12,8 @@ from jaxtyping import Float
 from jaxmuscle._common.arguments import require
 from jaxmuscle._common.text import choices, printable
 
-from ._frequency_response import COLUMNS, FITTED, HEADER, FrequencyResponse
+from ._frequency_response import COLUMNS, FITTED, HEADER, JOINT, FrequencyResponse
+from ._recording_choice import Origin
 from ._recording_files import read_table
 from ._recording_table import Table
 
@@ -47,7 +48,7 @@ def load_frequency_response(
 
     The columns are found by their names, in any order: `frequency`, `gain`, `phase`, and
     `coherence` or `stderr` or both. A unit may follow: `gain` in N/m (without unit), N/cm, N/mm,
-    kN/m, in Nm/rad or Nm/deg with a lever arm, or in dB above 1 N/m; `phase` in deg (without unit)
+    kN/m, in Nm/rad or Nm/deg of a joint, or in dB above 1 N/m; `phase` in deg (without unit)
     or rad; `stderr`, of the gain, in the gain's unit. Phase and gain are those of force over
     *lengthening*: the phase is near 0 at low frequency. `FrequencyResponse.save` writes such a
     file. `stiffness.csv`, which `jaxmuscle fit` writes, is read as well: its columns `real`,
@@ -58,7 +59,8 @@ def load_frequency_response(
     - `path`: the file
     - `segments`: the number of independent averages, one or one for each frequency, needed without
       `stderr`
-    - `lever_arm` [m]: which turns torque over angle into force over displacement
+    - `lever_arm` [m]: which turns torque over angle into force over displacement, else it stays
+      such; of `stiffness.csv` that of the fit
     - `name`: by default that of the file
     - `source`
 
@@ -66,22 +68,31 @@ def load_frequency_response(
     """
     table = read_table(path, 0)
     file = Path(table.file)
-    words = {
+    words: Origin = {
         "name": printable(file.stem) if name is None else name,
         "source": printable(file.name) if source is None else source,
     }
     try:
         if {*FITTED} <= {*table.columns}:
             frequency, real, imaginary, stderr = (_numbers(table, name, name) for name in FITTED)
-            return FrequencyResponse(frequency, real + 1j * imaginary, stderr, **words)
+            value = real + 1j * imaginary
+            return FrequencyResponse(frequency, value, stderr, lever_arm=lever_arm, **words)
         column = {}
         for role, (heading, unit) in _columns(table).items():
             column[role] = _numbers(table, heading, role) * UNITS[role][unit]
-            if unit in ROTATION:
-                column[role] /= _lever_arm(lever_arm, f"{heading} is torque over angle") ** 2
             if unit == "db":
                 column[role] = 10 ** (column[role] / 20)
-        return FrequencyResponse.from_gain(**column, segments=segments, **words)
+        found = _columns(table)
+        joint = found["gain"][1] in ROTATION
+        if "stderr" in found and (found["stderr"][1] in ROTATION) != joint:
+            raise ValueError("gain and stderr: one is torque over angle, give both alike")
+        unit = JOINT if joint else "N/m"
+        response = FrequencyResponse.from_gain(**column, segments=segments, unit=unit, **words)
+        if lever_arm is None:
+            return response
+        remedy = f"leave it out: the gain is in {found['gain'][1]}"
+        require(joint, "lever_arm", lever_arm, remedy)
+        return response.at_lever_arm(_lever_arm(lever_arm))
     except ValueError as error:
         # the place in the file instead of the number of an entry
         place = re.sub(r"entry (\d+)", lambda at: table.place(int(at[1]) - 1), str(error))
@@ -126,7 +137,6 @@ def _numbers(table: Table, name: str, role: str) -> Float[np.ndarray, " rows"]:
     return values
 
 
-def _lever_arm(given: float | int | None, what: str) -> float:
-    remedy = f"{what}: give the lever arm in m, as lever_arm=0.1"
-    require(given is not None and 0 < given < np.inf, "lever_arm", given, remedy)
-    return float(given or 1.0)
+def _lever_arm(given: float | int) -> float:
+    require(0 < given < np.inf, "lever_arm", given, "give the lever arm in m, as lever_arm=0.1")
+    return float(given)

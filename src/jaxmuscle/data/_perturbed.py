@@ -4,6 +4,7 @@ that they give: fluctuations of the force beside its response, and the dynamic s
 See docs/perturbed.md for the mathematics.
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Unpack
 
@@ -16,29 +17,37 @@ from jaxmuscle import plot
 from jaxmuscle._common.arguments import check_options, is_real, require
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.names import name_of_all
-from jaxmuscle.spectra._cross_spectrum import Response, response_of
+from jaxmuscle.spectra._cross_spectrum import LEAST_INPUT, Response, response_of
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from ._frequency_response import FrequencyResponse
+from ._frequency_response import JOINT, FrequencyResponse
 from ._measure import Measure, normal_interval
-from ._recording import Recording, pooled_target, recorded_settings
+from ._recording import FOUND, Recording, pooled_target, recorded_settings
 from ._recording_choice import About
-from ._recording_quality import Baseline, signal_of
-from ._second_order import SecondOrder, lateness, lengthens, second_order_fit
+from ._recording_quality import Baseline, running_median, runs, signal_of
+from ._second_order import UNITS, SecondOrder, lateness, lengthens, second_order_fit
 from ._target import Target
-from ._units import scale_to_si
+from ._units import quantity_of, scale_to_si
 
 SIGN_FOUND = 4.0  # standard errors from which on the sign of the displacement is found
-LEAST_MOVED, MOST_MOVED = 0.005, 100.0  # mm rms: what motors move
+# Of the displacement, and of the angle of a joint: unit in texts, how many of it.
+SHOWN = {False: ("mm", 1e3), True: ("deg", float(np.degrees(1.0)))}
+MOVED = {"mm": (0.005, 100.0), "deg": (0.02, 30.0)}  # rms: what motors move
+LEVER_ARM = 0.05  # m, at which a joint in N m and rad is carried to the model's N and m
+# of the response: Hz, by default and at most; times the rate of the recording
+HIGHEST, MOST, BELOW = 30.0, 45.0, 0.4
+TURNED = (
+    "the mean {0} is negative: its sign is turned, since the pull of a muscle counts as positive."
+    " Then the sign of the displacement is found"
+)
 NEGATIVE = (
     "the mean force is negative: count the muscle's pull as positive, or the stiffness has the"
     " wrong sign"
 )
-NEGATIVE_TURNED = (
-    ". With this force the displacement seems to count shortening as positive, so its sign was"
-    " turned. It will not be once the force is right"
-)
 CUT = 0.1  # s
+# Where the insertion moves: at how many Hz that is looked at; from which share of the usual
+# standard deviation on. For which share of the time a force without a level pulls either way.
+WATCHED, STILL_SHARE, BOTH = 100.0, 0.3, 0.1
 SHORTER = (
     "of the window from {:.4g} to {:.4g} s the fit uses {:.4g} to {:.4g} s: it needs {:g} s of the"
     " recording before and after what it uses. If you can, record that much longer"
@@ -82,6 +91,7 @@ class _Options(About, total=False):
 
     baseline: Baseline
     detrend: bool
+    band: Sequence[float] | None
 
 
 class PerturbedRecording(Shown, eqx.Module):
@@ -91,10 +101,17 @@ class PerturbedRecording(Shown, eqx.Module):
     lengthening then has a positive real part at low frequency. In the model's coordinates the
     lengthening is -x_z.
 
+    A joint has a torque in N m and an angle in rad instead, and all that is made of it is in N m
+    and rad: H in N m/rad.
+
     **Arguments:**
 
-    - `force`: a `Recording` in N, positive where the muscle pulls.
-    - `displacement`: a `Recording` in m, of the same rate, start, window and number of samples.
+    - `force`: a `Recording` in N (or N m), positive where the muscle pulls.
+    - `displacement`: a `Recording` in m (or rad), of the same rate, start, window and number of
+      samples.
+    - `lever_arm` [m]: with which force and displacement were made of a torque and an angle.
+    - `band` (low, high) [Hz] of the response; by default as far as the motion excites, at most to
+      30 Hz.
     - `name`, `source`: by default those of the force.
     - `notices`: what was done to the channels, in sentences; those of both channels are added.
     - `others`: recordings before and after a pause, as in `Recording`.
@@ -107,6 +124,8 @@ class PerturbedRecording(Shown, eqx.Module):
 
     force: Recording
     displacement: Recording
+    lever_arm: float | None = eqx.field(static=True)
+    band: tuple[float, float] | None = eqx.field(static=True)
     name: str = eqx.field(static=True)
     source: str = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
@@ -117,14 +136,20 @@ class PerturbedRecording(Shown, eqx.Module):
         force: Recording,
         displacement: Recording,
         *,
+        lever_arm: float | None = None,
+        band: tuple[float, float] | None = None,
         name: str | None = None,
         source: str | None = None,
         notices: Iterable[str] = (),
         others: Iterable["PerturbedRecording"] = (),
     ):
-        for argument, given, unit in (("force", force, "N"), ("displacement", displacement, "m")):
-            instead = "or use PerturbedRecording.from_array"
+        instead = "or use PerturbedRecording.from_array"
+        for argument, given in (("force", force), ("displacement", displacement)):
             require(isinstance(given, Recording), argument, given, f"give a Recording, {instead}")
+        units = ("N m", "rad") if force.unit == "N m" else ("N", "m")
+        for argument, given, unit in zip(
+            ("force", "displacement"), (force, displacement), units, strict=True
+        ):
             remedy = f"give it in {unit}, {instead}, which converts"
             require(given.unit == unit, f"{argument}.unit", given.unit, remedy)
         for field in ("rate", "start", "window"):
@@ -133,6 +158,7 @@ class PerturbedRecording(Shown, eqx.Module):
             require(same == other, f"displacement.{field}", other, remedy)
         _check_length(force.whole.size, displacement.whole.size)
         self.force, self.displacement, self.others = force, displacement, tuple(others)
+        self.lever_arm, self.band = lever_arm, band
         self.name = force.name if name is None else name
         self.source = force.source if source is None else source
         moved = [
@@ -154,8 +180,9 @@ class PerturbedRecording(Shown, eqx.Module):
         delay: float | int = 0.0,
         **options: Unpack[_Options],
     ) -> "PerturbedRecording":
-        """A recording from two arrays of one length; torque and angle are converted with the lever
-        arm.
+        """A recording from two arrays of one length.
+
+        Torque and angle of a joint stay such, in N m and rad. With a lever arm they become
 
             force = torque / lever_arm,   displacement = lever_arm · angle
 
@@ -163,52 +190,65 @@ class PerturbedRecording(Shown, eqx.Module):
 
         - `force`, `displacement`, shape `(times,)`, in `units` (N, mN, kN, kgf, gf, lbf; N m, N cm,
           N mm) and `displacement_units` (m, cm, mm, um; deg, rad); `rate` [Hz].
-        - `lever_arm` [m]: from the axis to the insertion; needed for a torque and for an angle.
+        - `lever_arm` [m]: from the axis to the insertion; needed for a torque without an angle, and
+          for an angle without a torque.
         - `positive`: what the displacement counts as positive, `"lengthening"` or `"shortening"`.
           `None`: found from the data. If a spring, a damper and a mass describe the response better
-          with the other sign, that of the displacement is turned, and a notice says so.
+          with the other sign, that of the displacement is turned, and a notice says so. A force
+          with a negative mean is turned first, since muscles pull.
         - `delay` [s]: by which the force channel lags behind the displacement channel; the
           displacement is shifted by it.
         - `options`: `name`, `source`, `start`, `window`, `notices`, `others`, as in `Recording`;
-          `baseline`, `detrend` too, of the force.
+          `baseline`, `detrend` too, of the force; `band`, as in `PerturbedRecording`.
 
         **Raises:** `ValueError` naming the argument, its value and the remedy.
         """
         check_options(cls.from_array, _Options, options)
+        band = _checked_band(options.pop("band", None), float(rate))
         known = positive in (None, "lengthening", "shortening")
         require(known, "positive", positive, "choose lengthening or shortening")
-        scale, turned = scale_to_si(units, "units", "force", lever_arm)
-        reach, swung = scale_to_si(
-            displacement_units, "displacement_units", "displacement", lever_arm
-        )
+        rotates = (quantity_of(units), quantity_of(displacement_units)) == ("torque", "angle")
+        joint = rotates and lever_arm is None
+        arm = 1.0 if joint else lever_arm
+        scale, turned = scale_to_si(units, "units", "force", arm)
+        reach, swung = scale_to_si(displacement_units, "displacement_units", "displacement", arm)
+        si = ("N m", "rad") if joint else ("N", "m")
         remedy = f"leave it out: {units} and {displacement_units} need none"
         require(lever_arm is None or turned or swung, "lever_arm", lever_arm, remedy)
         pull, moved = signal_of("force", force), signal_of("displacement", displacement)
         _check_length(pull.size, moved.size)
         if np.isfinite(moved).all() and _is_constant(moved):
             raise ValueError(
-                f"displacement: constant at {reach * moved[0] + 0.0:g} m, so nothing moved the"
-                " muscle. Take the force alone, as a hold, or choose another column"
+                f"displacement: constant at {reach * moved[0] + 0.0:g} {si[1]}, so nothing moved"
+                " the muscle. Take the force alone, as a hold, or choose another column"
             )
         pull, moved, begin, said = _shifted(scale * pull, reach * moved, float(rate), delay)
         notices, others = options.pop("notices", ()), options.pop("others", ())
         options["start"] = float(options.get("start", 0.0)) + begin
         words = {key: value for key, value in options.items() if key in About.__optional_keys__}
-        pulled = _recording("force", pull, rate, {**options, "unit": "N"})
-        given = _recording("displacement", moved, rate, words | {"unit": "m"})
-        turn, more = _sign(pulled, given, positive)
-        if np.mean(pulled.whole) < 0:
-            unsure = turn < 0 and positive is None
-            more = [NEGATIVE + NEGATIVE_TURNED] if unsure else [NEGATIVE, *more]
-        size = 1e3 * float(np.std(given.whole))
-        if not LEAST_MOVED < size < MOST_MOVED:
-            odd, other = ("much", "mm") if size > MOST_MOVED else ("little", "m")
+        pulled = _recording("force", pull, rate, {**options, "unit": si[0]})
+        given = _recording("displacement", moved, rate, words | {"unit": si[1]})
+        more = []
+        if np.mean(pulled.whole) < 0 and positive is None:
+            pulled = pulled._with(samples=-pulled.whole)
+            more.append(TURNED.format(pulled.quantity))
+        elif np.mean(pulled.whole) < 0:
+            more.append(NEGATIVE)
+        turn, found = _sign(pulled, given, positive)
+        more += found
+        (shown, many), small = SHOWN[joint], si[1]
+        size, (least, most) = many * float(np.std(given.whole)), MOVED[shown]
+        if not least < size < most:
+            odd, other = ("much", shown) if size > most else ("little", small)
             more.append(
-                f"the displacement is {size:.3g} mm rms, which is {odd} for a motor. If its column"
-                f" is in {other}, give --displacement-units {other} (Python: displacement_units=)"
+                f"the {given.quantity} is {size:.3g} {shown} rms, which is {odd} for a motor. If"
+                f" its column is in {other}, give --displacement-units {other} (Python:"
+                " displacement_units=)"
             )
-        lengthening = _recording("displacement", turn * moved, rate, words | {"unit": "m"})
-        return cls(pulled, lengthening, notices=(*notices, *said, *more), others=others)
+        lengthening = _recording("displacement", turn * moved, rate, words | {"unit": si[1]})
+        arm = float(lever_arm) if rotates and lever_arm is not None else None
+        said = (*notices, *said, *more)
+        return cls(pulled, lengthening, lever_arm=arm, band=band, notices=said, others=others)
 
     @property
     def rate(self) -> float:
@@ -220,13 +260,43 @@ class PerturbedRecording(Shown, eqx.Module):
         """(start, stop) [s] of the part that is analysed, or `None` for all of it."""
         return self.force.window
 
+    @property
+    def of_joint(self) -> bool:
+        """Whether it is in N m and rad."""
+        return self.force.unit == "N m"
+
+    @property
+    def stiffness_unit(self) -> str:
+        """Of its response: N/m, or N m/rad of a joint."""
+        return JOINT if self.of_joint else "N/m"
+
+    def at_lever_arm(self, arm: float) -> "PerturbedRecording":
+        """The torque and the angle of a joint as force and displacement at a distance [m] from its
+        axis."""
+        require(self.of_joint, "force.unit", self.force.unit, "only a torque has a lever arm")
+        require(is_real(arm) and arm > 0, "arm", arm, "give a distance above 0 m")
+        force = self.force._with(samples=self.force.whole / arm, unit="N", quantity=None)
+        whole = self.displacement.whole * arm
+        moved = self.displacement._with(samples=whole, unit="m", quantity=None)
+        return self._of(force, moved, lever_arm=float(arm))
+
+    def _of(self, force: Recording, moved: Recording, **changed: Any) -> "PerturbedRecording":
+        """With other channels."""
+        names = ("lever_arm", "band", "name", "source", "notices")
+        same = {name: getattr(self, name) for name in names}
+        return PerturbedRecording(force, moved, **same | changed)
+
     def steady(self, window: Sequence[float | int] | str | None = None) -> "PerturbedRecording":
         """The recording with the part as window in which the mean force is held: given, or found as
         by `Recording.steady`.
 
         Where a weak force answers with more than a tenth of itself, so that none is found, it is
         looked for in what is left of the force without the answer of a spring, a damper and a mass.
-        Both channels are cut alike.
+        If that shows none either, as where a reflex answers, the longest stretch is taken in which
+        the insertion moves (its standard deviation over 2 s is above 0.3 of the usual one) and the
+        rest of the force, the median over 1 s, is within half of its level; with any force if that
+        pulls either way for a tenth of the time. It has to be half of the time with motion. Both
+        channels are cut alike.
 
         **Raises:** `ValueError` as `Recording.steady`.
         """
@@ -239,22 +309,55 @@ class PerturbedRecording(Shown, eqx.Module):
         except ValueError:
             if window is not None:
                 raise
-            found = self._without_answer().steady()  # or it raises the same
-            alone = force._with(window=None, notices=found.notices)
-            steady = alone.steady(found.window)
+            rest = self._without_answer()
+            try:
+                found = rest.steady()
+            except ValueError:
+                found = self._while_moved(rest)
+                if found is None:
+                    raise
+            steady = force._with(window=found.window, notices=found.notices)._straight()
         moved = self.displacement.steady("all" if steady.window is None else steady.window)
-        words = {"name": self.name, "source": self.source, "notices": self.notices}
-        return PerturbedRecording(steady, moved, **words)
+        return self._of(steady, moved)
 
     def _without_answer(self) -> Recording:
         """The force less `K x + B x' + I x''` of the displacement, by least squares over all of the
         recording."""
-        x = self.displacement.whole
+        x = self.displacement.whole - np.mean(self.displacement.whole)
         speed = np.gradient(x, 1 / self.rate)
         columns = np.stack([np.ones_like(x), x, speed, np.gradient(speed, 1 / self.rate)], axis=1)
         columns /= np.linalg.norm(columns, axis=0)
         sizes = np.linalg.lstsq(columns, self.force.whole, rcond=None)[0]
         return self.force._with(samples=self.force.whole - columns[:, 1:] @ sizes[1:], window=None)
+
+    def _while_moved(self, rest: Recording) -> Recording | None:
+        """What is left of the force, with the part as window in which the insertion moves and it
+        has one level."""
+        rate = WATCHED
+        moved, left = self.displacement.resampled(rate).whole, rest.resampled(rate).whole
+        size = round(2 * rate)
+        mean, square = (scipy.ndimage.uniform_filter1d(moved**n, size) for n in (1, 2))
+        scatter = np.sqrt(np.maximum(square - mean**2, 0.0))
+        moves = scatter > STILL_SHARE * np.quantile(scatter, 0.75)
+        held, level = running_median(left, rate), float(np.median(left[moves]))
+        if not BOTH < np.mean(held[moves] > 0) < 1 - BOTH:
+            inside = moves & (np.abs(held - level) < abs(level) / 2)
+            said = "and the force stays within half of its level"
+        else:
+            inside, said = moves, "the force having no level of its own"
+        longest = max(runs(inside).tolist(), key=lambda run: run[1] - run[0], default=[0, 0])
+        if longest[1] - longest[0] < 0.5 * np.sum(moves):
+            return None
+        # a second is left for the ramps
+        start, stop = (
+            longest[0] + round(rate) * (longest[0] > 0),
+            longest[1] - round(rate) * (longest[1] < moved.size),
+        )
+        a, b = (min(rest.start + edge / rate, rest.stop) for edge in (start, stop))
+        if (b - a) * rate < size:
+            return None
+        words = f"{FOUND}{a:.2f} s to {b:.2f} s, where the insertion moves, {said}"
+        return rest._with(window=(a, b), notices=(*rest.notices, words))
 
     def frequency_response(
         self, settings: SpectrumSettings | str | None = None
@@ -270,20 +373,46 @@ class PerturbedRecording(Shown, eqx.Module):
         the displacement) leaves, given the displacement as it was. The overlap of segments is in
         them. Neighbouring bins share errors (with the Hann window about 0.45).
 
+        The bins are those of the `band`; those of `SpectrumSettings`, if such are given.
+
         **Arguments:** `settings`, as for `Recording.spectrum`, or a name.
 
         **Raises:** `ValueError` if the window has fewer than three segments, or bins lie above half
         the recorded rate.
         """
-        found = self._response(settings)
-        source = f"{self.source}, {self.force.window_in_words}"
-        fields = {"name": self.name, "source": source, "notices": self.notices}
+        return self._as_frequency_response(self._response(settings))
+
+    def _as_frequency_response(self, found: Response) -> FrequencyResponse:
         return FrequencyResponse(
-            found.frequency, found.value, found.stderr, found.coherence, **fields
+            found.frequency,
+            found.value,
+            found.stderr,
+            found.coherence,
+            name=self.name,
+            source=f"{self.source}, {self.force.window_in_words}",
+            notices=self.notices,
+            unit=self.stiffness_unit,
+            lever_arm=self.lever_arm,
         )
 
     def _response(self, settings: SpectrumSettings | str | None) -> Response:
-        return _response(self.force, self.displacement, recorded_settings(settings))
+        if not isinstance(settings, SpectrumSettings):
+            settings = self._to_band(recorded_settings(settings))
+        return _response(self.force, self.displacement, settings)
+
+    def _to_band(self, settings: SpectrumSettings) -> SpectrumSettings:
+        """The settings with the bins of the band; without low-pass, which cancels."""
+        low, high = self.band or (0.0, max(self.highest, float(settings.frequency[-1])))
+        bins = {
+            "first_bin": max(settings.first_bin, math.ceil(low / settings.resolution - 1e-9)),
+            "last_bin": math.floor(high / settings.resolution + 1e-9),
+        }
+        return settings.replace(filter_cutoff=None, **bins)
+
+    @property
+    def highest(self) -> float:
+        """Up to where the response is estimated [Hz]."""
+        return min(HIGHEST, BELOW * self.rate) if self.band is None else self.band[1]
 
     def second_order(self, settings: SpectrumSettings | str | None = None) -> dict[str, Measure]:
         """The classical description of the response by a spring, a damper and a mass.
@@ -294,23 +423,37 @@ class PerturbedRecording(Shown, eqx.Module):
         the errors are multiplied by √(chi² / its expectation): the muscle is more than a spring, a
         damper and a mass.
 
-        **Returns:** `{"K": ..., "B": ..., "I": ...}` [N/m, N s/m, kg], each a `Measure` with
-        `interval`.
+        **Returns:** `{"K": ..., "B": ..., "I": ...}` [N/m, N s/m, kg; of a joint N m/rad,
+        N m s/rad, kg m²], each a `Measure` with `interval`.
 
         **Source:** Kearney & Hunter 1990, Crit Rev Biomed Eng 18(1):55-87.
         """
-        value, stderr, _ = self._second_order(settings)
-        rows = zip(value.tolist(), stderr.tolist(), ("N/m", "N s/m", "kg"), strict=True)
+        value, stderr, *_ = self._second_order(settings)
+        rows = zip(value.tolist(), stderr.tolist(), UNITS[self.stiffness_unit], strict=True)
         measures = (
             Measure(number, error, unit, "spectrum", normal_interval(number, error))
             for number, error, unit in rows
         )
         return dict(zip("KBI", measures, strict=True))
 
-    def second_order_misfit(self, settings: SpectrumSettings | str | None = None) -> float:
-        """How many times as large as expected chi² of `second_order` is: about 1 where that is the
-        shape of the response."""
-        return self._second_order(settings).chi2
+    def second_order_of_joint(
+        self, settings: SpectrumSettings | str | None = None
+    ) -> dict[str, Measure]:
+        """The same about the axis, in N m/rad, N m s/rad and kg m², where torque and angle were
+        converted with a lever arm; else nothing."""
+        if self.lever_arm is None:
+            return {}
+        square = self.lever_arm**2
+        units = zip(self.second_order(settings).items(), UNITS[JOINT], strict=True)
+        return {name: one.times(square, unit) for (name, one), unit in units}
+
+    def second_order_misfit(
+        self, settings: SpectrumSettings | str | None = None
+    ) -> tuple[float, float]:
+        """How many times as large as expected chi² of `second_order` is, and how probable one so
+        large is: about 1 where that is the shape of the response."""
+        found = self._second_order(settings)
+        return found.chi2, found.p
 
     def _second_order(self, settings: Any, *, delayed: bool = False) -> SecondOrder:
         return second_order_fit(self._response(settings), delayed)
@@ -334,14 +477,15 @@ class PerturbedRecording(Shown, eqx.Module):
         return float(found.value[3]), float(found.stderr[3])
 
     def late(self, settings: SpectrumSettings | str | None = None) -> list[str]:
-        """A notice if the force is surely later or earlier than a spring, a damper and a mass
-        explain, else nothing."""
+        """Notices if the force is surely later or earlier than a spring, a damper and a mass
+        explain, and if the imaginary part of the response is surely negative, as of nothing that is
+        passive."""
         try:
             response = self._response(settings)
         except ValueError:
             # too short or too slow for a response, which says so itself where one is asked for
             return []
-        return lateness(response)
+        return [*lateness(response), *self._as_frequency_response(response).activity]
 
     def target(
         self,
@@ -374,16 +518,19 @@ class PerturbedRecording(Shown, eqx.Module):
 
     def _card(self) -> Card:
         force, pull, moved = self.force, self.force.samples, self.displacement.samples
-        largest = np.max(np.abs(moved - np.mean(moved)))
+        unit, (shown, many) = force.unit, SHOWN[self.of_joint]
+        size, largest = many * np.std(moved), many * np.max(np.abs(moved - np.mean(moved)))
+        scatter = f"standard deviation {np.std(pull):.3g} {unit}"
         known = [
             ("source", self.source),
             ("time", f"{force.start:g} s to {force.stop:g} s; {force.window_in_words}"),
-            ("force", f"mean {np.mean(pull):.4g} N, standard deviation {np.std(pull):.3g} N"),
-            ("moved", f"{1e3 * np.std(moved):.3g} mm rms, at most {1e3 * largest:.3g} mm"),
+            (str(force.quantity), f"mean {np.mean(pull):.4g} {unit}, {scatter}"),
+            ("moved", f"{size:.3g} {shown} rms, at most {largest:.3g} {shown}"),
             *(("notice", notice) for notice in self.notices),
         ]
-        size = f"{force.whole.size} samples at {self.rate:g} Hz"
-        return facts(f"{self.name}: force [N] and lengthening [m], {size}", known)
+        count = f"{force.whole.size} samples at {self.rate:g} Hz"
+        what = f"{force.quantity} [{unit}] and lengthening [{self.displacement.unit}]"
+        return facts(f"{self.name}: {what}, {count}", known)
 
 
 def _check_length(force: int, moved: int) -> None:
@@ -514,6 +661,12 @@ def perturbed_target(
       `Recording.target`
     """
     settings = recorded_settings(settings)
+    recordings = [one.at_lever_arm(LEVER_ARM) if one.of_joint else one for one in recordings]
+    first = recordings[0]
+    for one in recordings[1:]:
+        remedy = f"the first has {first.lever_arm}: one fit has one lever arm, and one band"
+        same = (one.lever_arm, one.band) == (first.lever_arm, first.band)
+        require(same, f"{one.name}: lever_arm", one.lever_arm, remedy)
     each = [
         _nonparametric(recording, settings) if stiffness is None else stiffness
         for recording in recordings
@@ -529,15 +682,15 @@ def perturbed_target(
     ]
     name = name_of_all([recording.name for recording in recordings]) if name is None else name
     target = pooled_target(pieces, name, "force", provenance, None, settings)
-    response = _pooled(moved, pieces, each[0], settings)
-    words = {"name": name, "source": target.source}
+    response = _pooled(moved, pieces, each[0], _band(recordings), settings.rate)
+    words = {"name": name, "source": target.source, "lever_arm": first.lever_arm}
     return target.with_stiffness(FrequencyResponse(*response, **words))
 
 
 def _nonparametric(recording: PerturbedRecording, settings: SpectrumSettings) -> Stiffness:
     """The response that was measured, held beyond its ends: that makes no odds, since nothing moves
     there."""
-    found = recording.frequency_response(settings)
+    found = recording._response(recording._to_band(settings))
     return lambda f: (
         np.interp(f, found.frequency, np.real(found.value))
         + 1j * np.interp(f, found.frequency, np.imag(found.value))
@@ -576,7 +729,7 @@ def _share_shown(moved: list[_Moved], settings: SpectrumSettings) -> tuple[float
         signals = (one.length, one.force - one.reply, one.bend)
         length, *others = (one.transform(x) for x in signals)
         density = _smooth(f, np.abs(others[0]) ** 2)
-        grouped = _grouped(f, _groups([f], settings))
+        grouped = _grouped(f, _groups([f], (0.0, float(settings.frequency[-1]))))
         sums = (grouped / density) @ (np.conj(length) * [length, *others]).T
         # a linear response that is somewhat wrong would be taken for a share of the nonlinear one
         slopes = sums[:, 1:] / np.maximum(np.real(sums[:, :1]), 1e-300)
@@ -651,12 +804,32 @@ def _reply(
     return reply, np.zeros_like(reply), predicted is None
 
 
-def _groups(each: list[Frequencies], settings: SpectrumSettings) -> Float[np.ndarray, " edges"]:
-    """Edges of groups of frequencies, from where every window holds some periods on."""
-    lowest = max(LOWEST, LEAST_PERIODS * max(float(f[1]) for f in each))
+def _checked_band(band: Any, rate: float) -> tuple[float, float] | None:
+    if band is None:
+        return None
+    highest = min(MOST, BELOW * rate)
+    remedy = f"give lowest and highest frequency, at least 0 and at most {highest:g} Hz"
+    try:
+        low, high = (float(edge) for edge in band)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    require(0 <= low < high <= highest, "band", band, remedy)
+    return low, high
+
+
+def _band(recordings: Sequence[PerturbedRecording]) -> tuple[float, float]:
+    """The frequencies of their response [Hz]."""
+    low = 0.0 if recordings[0].band is None else recordings[0].band[0]
+    return low, min(one.highest for one in recordings)
+
+
+def _groups(each: list[Frequencies], band: tuple[float, float]) -> Float[np.ndarray, " edges"]:
+    """Edges of groups of frequencies in the band, from where every window holds some periods on."""
+    lowest = max(LOWEST, band[0], LEAST_PERIODS * max(float(f[1]) for f in each))
     edges = [LOWEST]
-    while edges[-1] < settings.frequency[-1]:
-        edges.append(edges[-1] + np.clip(WIDTH * edges[-1], NARROWEST, WIDEST))
+    while edges[-1] < band[1]:
+        widest = max(WIDEST, edges[-1] / 30)
+        edges.append(edges[-1] + np.clip(WIDTH * edges[-1], NARROWEST, widest))
     return np.array([edge for edge in edges if edge >= lowest])
 
 
@@ -668,22 +841,29 @@ def _grouped(
 
 
 def _pooled(
-    moved: list[_Moved], pieces: list[Recording], stiffness: Stiffness, settings: SpectrumSettings
+    moved: list[_Moved],
+    pieces: list[Recording],
+    stiffness: Stiffness,
+    band: tuple[float, float],
+    rate: float,
 ) -> tuple[Frequencies, Ordinates, Frequencies]:
-    """The stiffness in groups of frequencies, those of all trials together with weights by their
-    errors: frequencies, values and standard errors."""
-    edges = _groups([one.frequency(settings.rate) for one in moved], settings)
+    """The stiffness in groups of frequencies that the motion excites, those of all trials together
+    with weights by their errors: frequencies, values and standard errors."""
+    edges = _groups([one.frequency(rate) for one in moved], band)
     sums = np.zeros((len(edges) - 1, 3), complex)
+    power = np.zeros(len(edges) - 1)
     for one, piece in zip(moved, pieces, strict=True):
         f, length, rest = (
-            one.frequency(settings.rate),
+            one.frequency(rate),
             one.transform(one.length),
             one.transform(piece.whole),
         )
         square = np.abs(length) ** 2
         columns = np.stack([square, np.conj(length) * rest, f * square], axis=1)
-        sums += _grouped(f, edges) / _smooth(f, np.abs(rest) ** 2) @ columns
-    weight, change, middle = sums[np.real(sums[:, 0]) > 0].T
+        grouped = _grouped(f, edges)
+        sums += grouped / _smooth(f, np.abs(rest) ** 2) @ columns
+        power += grouped @ square / np.maximum(grouped.sum(axis=1), 1)
+    weight, change, middle = sums[power >= max(LEAST_INPUT * power.max(), 1e-300)].T
     weight, frequency = np.real(weight), np.real(middle / weight)
     return frequency, stiffness(frequency) + change / weight, 1 / np.sqrt(2 * weight)
 

@@ -559,7 +559,8 @@ def notices_of(
         mine = [burst for burst in bursts if burst.signal == i and not named]
         events = _events(recordings[i], mine)
         # a slip of a second looks like another level
-        own += events or (_ramped(signal, rate, unit) if held else ())
+        found = any(notice.startswith(FOUND) for notice in own)
+        own += events or (_ramped(signal, rate, unit) if held and not found else ())
         own += _drift(signal) if drift else ()
     names = [recording.name for recording in recordings]
     said = _with_names(each, names)

@@ -323,8 +323,7 @@ def _moved(table: Table, others: list[str], force: str) -> str:
     moves = movement_of(table, moving)
     if moves.rests:
         return f". {moving} rests: it moves by {moves}"
-    turned = {kinds[force], kinds[moving]} & {"torque", "angle"}
-    arm = " --lever-arm METRES" if turned else ""
+    arm = " --lever-arm METRES" if (kinds[force] == "torque") != (kinds[moving] == "angle") else ""
     return (
         f". {moving} moves by {moves}, so `jaxmuscle fit` takes it for a record of a moved"
         " insertion. If a motor moved the muscle, give both channels: --force-column"

@@ -4,7 +4,7 @@ import contextlib
 import gzip
 import os
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Unpack, overload
 
@@ -22,6 +22,12 @@ from ._recording_table import Table, channels_table, find
 from ._recording_time import clock
 from ._text_tables import holds_text
 from .dialects._dialects import EXPORTS
+
+
+class _Options(ReadingOptions, total=False):
+    """Of two channels, too."""
+
+    band: Sequence[float] | None
 
 
 @overload
@@ -42,7 +48,7 @@ def load_recording(  # pyright: ignore[reportInconsistentOverload]
     delay: float | int = 0.0,
     skip_rows: int = 0,
     sheet: str | int | None = None,
-    **options: Unpack[ReadingOptions],
+    **options: Unpack[_Options],
 ) -> Recording | PerturbedRecording:
     """Load a recording from text, Excel, MATLAB, NumPy, C3D, EDF, TDMS, AcqKnowledge or Spike2
     files.
@@ -90,16 +96,24 @@ def load_recording(  # pyright: ignore[reportInconsistentOverload]
       that of the force.
     - `lever_arm` [m]: from the joint's axis to the point where the force acts. A torque is divided
       by it and becomes a force in N; of two channels, an angle is multiplied by it and becomes a
-      displacement.
-    - `positive`, `delay` [s]: of two channels, see `PerturbedRecording.from_array`.
+      displacement. Without it torque and angle stay such.
+    - `positive`, `delay` [s], `band` (low, high) [Hz]: of two channels, see
+      `PerturbedRecording.from_array`.
     - `quantity`, `baseline`, `detrend`: as in `Recording`; `baseline` also as a text, "0:1".
 
     **Raises:** `ValueError` naming file, line or argument, and the remedy; `ImportError` that says
     what to install.
     """
-    check_options(load_recording, ReadingOptions, options)
-    reading = Reading(**options)
-    both = {"displacement_units": displacement_units, "positive": positive, "delay": delay}
+    check_options(load_recording, _Options, options)
+    given: dict[str, Any] = dict(options)
+    band = given.pop("band", None)
+    reading = Reading(**given)
+    both = {
+        "displacement_units": displacement_units,
+        "positive": positive,
+        "delay": delay,
+        "band": band,
+    }
     if force is None or displacement is None:
         remedy = "belongs to recordings of two channels; give `force` and `displacement`"
         strange = {"force": force, "displacement": displacement, **both, "delay": delay or None}

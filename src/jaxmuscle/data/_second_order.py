@@ -15,15 +15,18 @@ SURE, WORSE = 4.0, 2.0
 
 
 Parameters = Float[np.ndarray, " parameters"]
+# of K, B and I, by the unit of the response
+UNITS = {"N/m": ("N/m", "N s/m", "kg"), "N m/rad": ("N m/rad", "N m s/rad", "kg m²")}
 
 
 class SecondOrder(NamedTuple):
     """`value` and `stderr` of K [N/m], B [N s/m], I [kg] and, if fitted, of the delay τ [s]; chi²
-    over its expectation."""
+    over its expectation, and how probable one so large is if the response has that shape."""
 
     value: Parameters
     stderr: Parameters
     chi2: float
+    p: float
 
 
 def second_order_shape(frequency: Float[np.ndarray, " bins"], parameters: Parameters) -> np.ndarray:
@@ -36,8 +39,12 @@ def second_order_shape(frequency: Float[np.ndarray, " bins"], parameters: Parame
 def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     """K, B and I, and a delay, by least squares weighted with the response's errors.
 
-    The errors take the correlation of neighbouring bins into account. Where chi² is more than it
-    should be, since the muscle has another shape, they are multiplied by √(chi² / its expectation).
+    What a bin sees of the shape is its mean over the frequencies in that bin. The errors take the
+    correlation of neighbouring bins into account. Where chi² is more than it should be, since the
+    muscle has another shape, they are multiplied by √(chi² / its expectation).
+
+    `p`: the square of every residual, made shorter as in `FrequencyResponse.p_none`, has the chi²
+    distribution; their sum is compared with that of the same mean and variance.
     """
     f, weight = response.centre, 1 / np.tile(response.stderr, 2)
     count = 3 + delayed
@@ -47,7 +54,7 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     scale = np.append(scale, 1 / (2 * np.pi * f.max()))[:count]
 
     def residuals(x: Parameters) -> Float[np.ndarray, " twice"]:
-        return parts(second_order_shape(f, x * scale) - response.value) * weight
+        return parts(_seen(response, x * scale) - response.value) * weight
 
     start = np.linalg.lstsq(shapes, parts(response.value) * weight)[0]
     found = scipy.optimize.least_squares(
@@ -61,7 +68,36 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     spread = inverse @ inner @ inverse
     expected = 2 * f.size - np.trace(inverse @ inner)
     chi2 = float(2 * found.cost / expected)
-    return SecondOrder(found.x * scale, np.sqrt(np.diag(spread) * max(chi2, 1.0)) * scale, chi2)
+    squares = np.sum(found.fun.reshape(2, -1) ** 2, axis=0)
+    averages = averages_of(response.value, response.stderr, response.coherence)
+    total = np.sum(shortened(squares, averages))
+    left = covariance - found.jac @ inverse @ (found.jac.T @ covariance)
+    unit = np.sum(left * left.T) / expected  # half of the variance over the mean
+    p = float(scipy.stats.chi2.sf(total / unit, expected / unit))
+    return SecondOrder(found.x * scale, np.sqrt(np.diag(spread) * max(chi2, 1.0)) * scale, chi2, p)
+
+
+def averages_of(value: np.ndarray, stderr: np.ndarray, coherence: np.ndarray) -> np.ndarray:
+    """How many independent averages errors and coherence imply: (1 - γ²) |H|² / (2 γ² stderr²)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (1 - coherence) / (2 * coherence) * (np.abs(value) / stderr) ** 2
+
+
+def shortened(squares: np.ndarray, averages: np.ndarray) -> np.ndarray:
+    """`|e|² / stderr²` of errors that are estimated from so many averages n, so that it has the
+    chi² distribution: 2 (n - 1) ln(1 + |e|² / (2 (n - 1) stderr²))."""
+    # fewer than one average and a bit would be divided by nothing
+    spare = np.maximum(2 * (averages - 1), 1e-3)
+    return spare * np.log1p(squares / spare)
+
+
+def _seen(response: Response, parameters: Parameters) -> np.ndarray:
+    """What the bins of a response see of `second_order_shape`."""
+    k, b, i, *delay = parameters
+    turn = 2j * np.pi
+    return (k + turn * response.centre * b + turn**2 * response.square * i) * np.exp(
+        -turn * response.centre * sum(delay)
+    )
 
 
 def lateness(response: Response) -> list[str]:
@@ -99,7 +135,7 @@ def _terms(response: Response) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarra
     """Scales of K, B and I, and the response to one of each, in standard errors."""
     f = response.centre
     scale = np.abs(response.value).max() / (2 * np.pi * f.max()) ** np.arange(3)
-    shapes = np.stack([parts(second_order_shape(f, unit * scale)) for unit in np.eye(3)], axis=1)
+    shapes = np.stack([parts(_seen(response, unit * scale)) for unit in np.eye(3)], axis=1)
     return scale, shapes / np.tile(response.stderr, 2)[:, None]
 
 

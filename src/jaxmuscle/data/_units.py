@@ -214,10 +214,15 @@ def scale_to_si(unit: str, argument: str, quantity: str, lever_arm: Any) -> tupl
             f" {choices(unit, (*straight, *_SI[turned]))}"
         )
         raise ValueError(f"{argument}={unit!r}: {remedy}")
-    remedy = (
-        f"`{argument}` is {known}: give the distance from the axis to the insertion in m, as"
-        " lever_arm=0.1; or, if nothing moved the insertion, the force alone, as `column`"
-    )
+    if lever_arm is None:
+        other = "angle" if turned == "torque" else "torque"
+        raise ValueError(
+            f"the {quantity} is {'a torque' if turned == 'torque' else 'an angle'} in {known},"
+            f" without {'an angle' if other == 'angle' else 'a torque'}: give the distance from the"
+            " axis to the insertion in m, as lever_arm=0.1; or, if nothing moved the insertion, the"
+            " force alone, as `column`"
+        )
+    remedy = "give the distance from the axis to the insertion in m, as lever_arm=0.1"
     require(is_real(lever_arm) and lever_arm > 0, "lever_arm", lever_arm, remedy)
     scale, arm = _SI[turned][known], float(lever_arm)
     return (scale / arm if quantity == "force" else scale * arm), True

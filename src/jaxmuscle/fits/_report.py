@@ -314,6 +314,10 @@ UNCHECKED = (
     "not done: the check by new simulations, the test of other frequencies of the harmonic, and its"
     " p-value. --quick (check_seeds=0) leaves these out, and so does an interruption"
 )
+UNSIMULATED = (
+    "the fitted muscle cannot be simulated ({}). So the fluctuations are those of the formula,"
+    " without a check. The response and its numbers do not rest on a simulation"
+)
 TOGETHER = (
     "fitted by the formula alone: no correction and no check by simulation, no profile and no"
     " p-value of the harmonic. For these, fit this target alone with the usual settings"
@@ -377,6 +381,7 @@ def report_fit(
                 check_power(part.task, moments)
     except ValueError as error:
         return _failed(problem, common, str(error))
+    unchecked: tuple[str, ...] = ()
     try:
         made = [
             (
@@ -387,7 +392,11 @@ def report_fit(
             for part, task, moments in zip(problem.parts, tasks, seen.moments, strict=True)
         ]
     except (SimulationError, ValueError) as error:
-        return _failed(problem, common, f"the fitted task cannot be simulated: {error}")
+        if all(part.points is None for part in problem.parts):
+            return _failed(problem, common, f"the fitted task cannot be simulated: {error}")
+        # a response is known without
+        made = [_expected_only(moments) for moments in seen.moments]
+        plan, unchecked = plan._replace(check_seeds=0), (UNSIMULATED.format(error),)
     found = ended.found
     judgement, covariance = ended.adequacy, ended.covariance
     known = Identifiability.of_covariance(covariance)
@@ -468,6 +477,7 @@ def report_fit(
         harmonic_p_value=None if line_test is None else line_test.p_value,
         # the gravest first: a printed result shows few of them
         notices=(
+            *unchecked,
             *ended.judged[1],
             *mass_notices(problem.coordinates, theta),
             *reach_notices(derived, parts),

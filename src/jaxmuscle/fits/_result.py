@@ -2,6 +2,7 @@
 and what it cannot say. `_report.py` makes it; all that reads fits takes it from here.
 """
 
+import dataclasses
 import math
 import os
 from collections.abc import Mapping
@@ -389,6 +390,17 @@ class Estimate(Shown, eqx.Module):
         )
         return Card(
             f"{self.in_words()} {unit}".strip() + (f" ({'; '.join(known)})" if known else "")
+        )
+
+    def times(self, factor: float, unit: str) -> "Estimate":
+        """The number in another scale, a positive one."""
+        low, high = (None if e is None else factor * e for e in self.interval or (None, None))
+        return dataclasses.replace(
+            self,
+            value=factor * self.value,
+            unit=unit,
+            stderr=None if self.stderr is None else factor * self.stderr,
+            interval=None if self.interval is None else (low, high),
         )
 
     def row(self) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -12,7 +13,8 @@ from jaxtyping import Float
 from jaxmuscle._common.arguments import require
 from jaxmuscle._common.arrays import as_numbers, with_nulls
 from jaxmuscle._common.keys import key_of
-from jaxmuscle.data._frequency_response import check_seen
+from jaxmuscle.data._frequency_response import FrequencyResponse, check_seen
+from jaxmuscle.data._perturbed import LEVER_ARM
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._parameters import (
@@ -123,7 +125,8 @@ def at_mean(
     task: AbstractTask, target: Target, options: FitOptions
 ) -> tuple[AbstractTask, FitOptions]:
     """The task scaled to the target's mean force, where it states one in newtons, which then is
-    data; P_w follows from it.
+    data; P_w follows from it. A moved joint is carried to its response instead, and so is a moved
+    limb whose force varies by more than its mean.
 
     Not where the fit is given a `mean_force` (or False), where P_w is fixed, nor for a muscle that
     is not the paper's.
@@ -132,13 +135,22 @@ def at_mean(
         return task, dataclasses.replace(options, mean_force=options.mean_force or None)
     level = next((name for name in FORCES if name in task.parameter_names), None)
     stated = target.mean_force if task.output_unit == "N" and is_scalable(task.muscle) else None
+    response = target.stiffness if is_scalable(task.muscle) else None
+    arm = None if response is None else response.lever_arm
+    varies = stated is not None and target.coefficient_of_variation is None
+    if response is not None and varies:
+        # a force that varies by more than its mean: that is no scale, and no datum
+        stated, arm = None, arm or LEVER_ARM
     if stated is None or level is None or level in (options.fix or {}):
-        return task, options
+        return task if arm is None else _on_joint(task, task, response, arm), options
     free = (*options.also_free, level)
     moved = task.at_force(stated[0])
     factor = float(moved["m_w"]) / float(task["m_w"])
     if target.stiffness is not None:
         moved = with_masses(moved, task, factor)
+        if arm is not None:
+            moved = _on_joint(task, moved, response, arm)
+            return moved, dataclasses.replace(options, mean_force=stated, also_free=free)
     return moved, dataclasses.replace(options, mean_force=stated, also_free=free, carried=factor)
 
 
@@ -151,6 +163,34 @@ def with_masses(carried: AbstractTask, task: AbstractTask, factor: float) -> Abs
     kept = {name: task[name] for name in MASSES}
     damping = {name: task[name] * np.sqrt(factor) for name in ("c_w", "c_z")}
     return carried.replace(**kept, **damping)
+
+
+def _on_joint(
+    task: AbstractTask, moved: AbstractTask, stiffness: FrequencyResponse | None, arm: float
+) -> AbstractTask:
+    """The task as it is at the lever arm r of a joint, with spring K, damper and mass I of its
+    response.
+
+        x_ref, v_ref ∝ r,   m = m₀ I / I₀,   K_0 = K_00 K / K₀,   C_0 = C_00 √(K I / (K₀ I₀))
+
+    I₀ and K₀ are those of `task` (m_z; both stiffnesses in series), at the lever arm `LEVER_ARM`.
+    Both damping ratios stay, and P_w is that of `moved`, or in proportion if that is `task`. All of
+    it is about the axis what it is at any other r.
+    """
+    assert stiffness is not None
+    k, i = stiffness.spring_and_mass
+    k_w, k_z, *_ = (float(value) for value in task.muscle.base())
+    stiffer, heavier = k * (1 / k_w + 1 / k_z), i / float(task["m_z"])
+    longer = arm / LEVER_ARM
+    damped = math.sqrt(stiffer * heavier)
+    factors = {
+        **dict.fromkeys(MASSES, heavier),
+        **dict.fromkeys(("x_ref_w", "x_ref_z", "v_ref_w", "v_ref_z"), longer),
+        **dict.fromkeys(("k_w", "k_z"), stiffer / longer**2),
+        **dict.fromkeys(("c_w", "c_z"), damped / longer**2),
+        **({"P_w": stiffer * longer} if moved is task else {}),
+    }
+    return moved.replace(**{name: float(task[name]) * f for name, f in factors.items()})
 
 
 class Plan(NamedTuple):

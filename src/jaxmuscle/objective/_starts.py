@@ -17,6 +17,7 @@ from ._coordinates import Coordinates
 from ._least_squares import Minima, for_all, least_squares
 from ._problem import FitProblem
 from ._residuals import Data, Residuals
+from ._two_tissues import muscle_in_series
 
 RANGE = 30.0  # of stiffness and damping, about the default
 PEAKED = 3  # of every four starts, the one at a peak
@@ -225,8 +226,8 @@ def _answering_rows(count: int) -> Int[np.ndarray, " rows"]:
 
 def muscle_of_response(problem: FitProblem) -> dict[str, float]:
     """Values of the muscle with which the dynamic stiffness alone is fitted best, of some searches
-    and, unless these agree, of more. Nothing where no insertion was moved, and of an own muscle, of
-    which nobody knows which parameters answer.
+    and, unless these agree, of more; the first begins at `muscle_in_series`. Nothing where no
+    insertion was moved, and of an own muscle, of which nobody knows which parameters answer.
 
     It does not depend on what makes the muscle fluctuate: models that differ in that share it.
     """
@@ -237,7 +238,12 @@ def muscle_of_response(problem: FitProblem) -> dict[str, float]:
         return {}
     spread = np.zeros((2 * sum(SEARCHES), len(c.names)))
     _spread_coefficients(problem, spread)
-    starts, objective = c.from_theta(spread[1::2]), _without_spectra(problem.linear(), answers)
+    spread = spread[1::2]
+    for part in problem.parts:
+        for name, value in muscle_in_series(part, part.task).items():
+            if name in c.names:
+                spread[0, c.names.index(name)] = c.theta_of(name, value)
+    starts, objective = c.from_theta(spread), _without_spectra(problem.linear(), answers)
     blind = tuple(map(_blind, objective.data))
     ends, cost = np.zeros((0, starts.shape[1])), np.zeros(0)
     for some in np.split(starts, np.cumsum(SEARCHES)[:-1]):

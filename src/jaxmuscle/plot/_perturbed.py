@@ -55,9 +55,10 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> A
     halves = sum(heights[:2]), sum(heights[2:])
     upper, lower = fig.subfigures(2, 1, squeeze=False, height_ratios=halves)[:, 0]
     traces, closer = upper.subplots(2, 2, sharex="col", sharey="row", width_ratios=(1.6, 1)).T
+    moved = ("Angle (deg)", np.degrees(1.0)) if recording.of_joint else ("Lengthening (mm)", 1e3)
     channels = (
-        (recording.force, 1.0, "Force (N)", BLUE),
-        (recording.displacement, 1e3, "Lengthening (mm)", VERMILLION),
+        (recording.force, 1.0, "Torque (N m)" if recording.of_joint else "Force (N)", BLUE),
+        (recording.displacement, moved[1], moved[0], VERMILLION),
     )
     for whole, near, (channel, scale, label, colour) in zip(traces, closer, channels, strict=True):
         whole_trace(whole, channel, "window", scale, color=colour, lw=0.5)

@@ -37,7 +37,7 @@ def gain(
         ax.plot(fine, np.abs(smooth), color=BLUE, lw=1.2, label=name, zorder=2)
     log_axis(ax, "y")
     log_axis(ax)
-    ax.set_ylabel("Gain (N/m)")
+    ax.set_ylabel(f"Gain ({response.unit})")
     ax.set_title(title, parse_math=False)
     legend(ax, "above")
 
@@ -58,7 +58,9 @@ def phase(ax: Axes, response: Any, curve: Curve | None = None) -> None:
     ax.set_ylabel("Phase (deg)")
     low, high = ax.get_ylim()
     ax.yaxis.set_major_locator(
-        MultipleLocator(45 if high - low > 100 else 15 if high - low > 30 else 5)
+        MultipleLocator(
+            90 if high - low > 300 else 45 if high - low > 100 else 15 if high - low > 30 else 5
+        )
     )
     log_axis(ax)
 

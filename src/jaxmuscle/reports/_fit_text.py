@@ -21,6 +21,7 @@ from jaxmuscle.data._measured_text import (
     tremor_lines,
 )
 from jaxmuscle.data._recording import FOUND, UNRAMPED
+from jaxmuscle.data._second_order import UNITS
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._checks import CONVERGED
 from jaxmuscle.fits._intervals import HALF_POWER
@@ -252,6 +253,7 @@ def _results(result: FitResult, saved: str | None) -> list[str]:
     lines += [_row(name, p, rhythms) for name, p in rows.items()]
     rows |= {n: p for n, p in limb.items() if p.stderr is not None or p.interval is not None}
     lines += [f"   {_per_newton(result, rows)}"] * bool(_per_newton(result, rows))
+    lines += _about_axis(result)
     if recorded and not moved and len(result.ladder) > 1:
         lines.append(f"  {CHOSEN}")
     loose = [n for n, p in every.items() if p.stderr is None and p.free and n not in rows]
@@ -294,6 +296,23 @@ def _briefly(p: Estimate) -> str:
     alone = p.stderr is None and p.interval is not None
     said = p.interval_in_words() if alone else p.in_words()
     return said + f" {p.unit}" * (p.unit not in ("1", ""))
+
+
+def _about_axis(result: FitResult, wide: int = WIDTH) -> list[str]:
+    """The numbers of a joint: those of stiffness, damping and mass times the square of the lever
+    arm."""
+    responses = (part.target.stiffness for part in result.parts.values())
+    arm = next((one.lever_arm for one in responses if one is not None and one.lever_arm), None)
+    if arm is None:
+        return []
+    units = dict(zip(UNITS["N/m"], UNITS["N m/rad"], strict=True))
+    lines = [f"  About the axis of the joint (those in N and m are at {arm:g} m from it):"]
+    for name, p in result.as_shown(result.determined).items():
+        if base_of(name) in {*LIMB, *TISSUES} and p.unit in units:
+            one = p.times(arm**2, units[p.unit])
+            number = f"{one.in_words()} {one.unit}"
+            lines.append(f"  {name:<{wide}}{number:<25} {one.interval_in_words()}".rstrip())
+    return lines if len(lines) > 1 else []
 
 
 def unknown_kinds(loose: Iterable[str], known: Iterable[str]) -> list[str]:
@@ -406,6 +425,7 @@ def _whole_model(result: FitResult) -> list[str]:
         else "would be determined if the model held"
     )
     lines = _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
+    lines += _about_axis(result, 18)
     lines += [f"  {sentence}" for sentence in (*_counted(rows, every), *_by_band(result, bands))]
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
     alone = {name: p for name, p in loose.items() if p.interval is not None}

@@ -24,7 +24,7 @@ class Response(NamedTuple):
     `stderr` is the standard error of the real and of the imaginary part of `value`, `correlation`
     that of the errors of bins, `E e_k e_l* / √(E|e_k|² E|e_l|²)`. `centre` is where the input that
     a bin sees lies on the average [Hz]: at an edge of the input's band not in the middle of the
-    bin, and to first order `value` is H at the centre.
+    bin, and to first order `value` is H at the centre. `square` is the mean of f² there [Hz²].
     """
 
     frequency: Bins
@@ -33,6 +33,7 @@ class Response(NamedTuple):
     coherence: Bins
     correlation: Complex[np.ndarray, "bins bins"]
     centre: Bins
+    square: Bins
 
 
 def ordinates(
@@ -87,20 +88,25 @@ def response_of(
     cross, total = np.sum(x.conj() * y, axis=(0, 2)), np.sum(np.abs(y) ** 2, axis=(0, 2))
     expected = count * np.sum(np.abs(rows.reshape(*shape, n)) ** 2, axis=(1, 2)) - variance * power
     noise = np.maximum(total - np.abs(cross) ** 2 / power, 0.0) / expected
+    centre, square = _centres(given, rows.reshape(*shape, n), settings.rate)
     return Response(
         frequency=settings.frequency[kept],
         value=cross / power,
         stderr=np.sqrt(variance * noise / 2),
         coherence=np.abs(cross) ** 2 / (power * total),
         correlation=v / np.sqrt(np.outer(variance, variance)),
-        centre=_centres(given, rows.reshape(*shape, n), settings.rate),
+        centre=centre,
+        square=square,
     )
 
 
-def _centres(given: Times, rows: Complex[np.ndarray, "bins tapers n"], rate: float) -> Bins:
+def _centres(
+    given: Times, rows: Complex[np.ndarray, "bins tapers n"], rate: float
+) -> Float[np.ndarray, "2 bins"]:
     """`Σ f |W_k(f)|² S(f) / Σ |W_k(f)|² S(f)`, S the input's periodogram, W_k the transform of a
-    bin's rows."""
+    bin's rows; the same of f²."""
     f, n = np.fft.rfftfreq(given.size, 1 / rate), given.size
     density = np.abs(np.fft.rfft(given - given.mean())) ** 2
     seen = (np.sum(np.abs(np.fft.fft(row.conj(), n)[:, : f.size]) ** 2, axis=0) for row in rows)
-    return np.array([(share * density) @ f / (share @ density) for share in seen])
+    means = ((share * density) @ np.stack([f, f**2], axis=1) / (share @ density) for share in seen)
+    return np.stack(list(means), axis=1)
