@@ -134,7 +134,8 @@ class Point(NamedTuple):
 
     def at(self, objective: Residuals, theta: Float[np.ndarray, "rows free"]) -> "Point":
         """What it sees at other θ, within what is looked at."""
-        return Point.of(self.problem, objective, expand(objective, np.clip(theta, -MOST, MOST)))
+        most = np.maximum(MOST, np.abs(self.theta[0]) + 1)  # the fit itself may lie far out
+        return Point.of(self.problem, objective, expand(objective, np.clip(theta, -most, most)))
 
     @property
     def gain(self) -> Float[np.ndarray, "free free"]:
