@@ -387,13 +387,19 @@ SECTIONS = (
             Shown(
                 "gallery/study.png",
                 "study.plot()",
-                "A study: spectra of people and of groups, peaks marked",
+                "A study: spectra of people and their means, tremors marked",
                 "study.md",
             ),
             Shown(
                 "gallery/quantities.png",
                 'study.figures()["quantities"]',
                 "Its quantities: people, joined, and the means with their intervals",
+                "study.md",
+            ),
+            Shown(
+                "gallery/study_trials.png",
+                "jm.plot.study_trials(study)",
+                "Its recordings, with what is analysed",
                 "study.md",
             ),
         ),

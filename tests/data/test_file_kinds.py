@@ -52,6 +52,11 @@ KINDS = {  # text; endings; kind
         TEXTS,
         RECORDING,
     ),
+    "laboratory's name of the file": (
+        "File\tx.dat\nDate\t2026.12.01\n" + "1\t2\n" * 300,
+        TEXTS,
+        RECORDING,
+    ),
     "header of one cell": (
         "Frequency 1000 Hz\ntime\tforce\n" + "1\t2\n" * 300,
         TEXTS,
@@ -61,6 +66,7 @@ KINDS = {  # text; endings; kind
     "response, short names": ("f;gain;phase;coherence\n" + STIFF, TEXTS, RESPONSE),
     "fitted response": ("frequency_hz,real,imaginary,stderr\n" + STIFF, ["csv"], RESPONSE),
     "study": ("# pilot\nFile,Person\na.csv,anna\n", ["csv", "txt"], STUDY),
+    "study, person called otherwise": ("file,subject\na1.csv,anna\n", ["csv", "txt"], STUDY),
     "study, semicolons": ("person;group;file\nanna;old;a.csv\n", ["csv"], STUDY),
     "study in TOML": ('table = "study.csv"\n', ["toml"], STUDY),
     "recordings in TOML": ("rate = 100\n" + TRIALS, ["toml"], STUDY),

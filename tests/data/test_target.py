@@ -580,7 +580,7 @@ def test_bad_toml(case, tmp_path):
         ("", "no bundled target ''"),
         ("nowhere.csv", "nowhere.csv: no such file"),
         ("folder/hamilton-2004", "the bundled target is called 'hamilton-2004'"),
-        ("hamilton-2004.toml", "no such file; the bundled target is called 'hamilton-2004'"),
+        ("hamilton-2004.toml", "; the bundled target is called 'hamilton-2004'"),
         (".", "is a folder"),
         ("a\0.csv", "embedded null"),
         ("x" * 5000 + ".csv", "cannot be read: File name too long"),

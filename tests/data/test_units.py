@@ -270,7 +270,7 @@ def test_a_hold_without_tremor_band_says_so():
 def test_the_level_over_the_mvc(tmp_path):
     one = jm.data.steadiness(jm.Recording(X, RATE), mvc=400)
     assert one["level"].value == pytest.approx(np.mean(X) / 400, rel=1e-3)
-    assert "\n  over the MVC              9.9" in str(one)
+    assert "\n    over the MVC              9.9" in str(one)
     assert "level" not in jm.data.steadiness(jm.Recording(X, RATE)).measures
     with pytest.raises(ValueError, match="mvc=30: give a force above the mean"):
         jm.data.steadiness(jm.Recording(X, RATE), mvc=30)

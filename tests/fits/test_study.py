@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import json
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -18,11 +17,12 @@ from refits import without_intervals
 from test_result import made_result
 
 import jaxmuscle as jm
-from jaxmuscle.data._study_table import Cell
+from jaxmuscle.data._study_table import Cell, Trial
 from jaxmuscle.fits import Estimate, StudyResult, _study
 from jaxmuscle.fits._differences import corrected
 from jaxmuscle.fits._result import Adequacy
 from jaxmuscle.fits._study import USUAL, _checked
+from jaxmuscle.reports import study_notices
 
 PEOPLE, CONDITIONS = 5, ("rest", "tired")
 REJECTED = Adequacy(60.0, 20.0, 0.001, "power from 4 to 6 Hz")
@@ -36,6 +36,15 @@ OPTIONS = {
     "key": 0,
     "reading": {},
 }
+
+
+def read(count, chosen="given"):
+    """So many recordings, of which 8 s were analysed."""
+    time = np.arange(200) / 20
+    return tuple(
+        Trial(f"{i}.csv", str(i), "force", 100.0, 1.0, 9.0, chosen, time, np.sin(time) + i)
+        for i in range(1, count + 1)
+    )
 
 
 def values(seed=0):
@@ -74,7 +83,7 @@ def made_study(numbers=None, left_out=(), rejected=(), **options):
                 "resonance_frequency": other,
             }
             result = made_result(target=target, derived=derived, **more)
-            cells.append(Cell(person, group, condition, 2, (100.0, 100.0), target))
+            cells.append(Cell(person, group, condition, read(2), target, power.mean(axis=0) / 25))
             results[name] = result
     labels = {cell.target.name: f"{cell.group}, {cell.condition}" for cell in cells}
     cohort = jm.fits.CohortResult(results, labels, {})
@@ -149,6 +158,8 @@ def test_the_numbers_of_a_rejected_model_are_left_out_and_what_is_measured_is_no
     assert groups["median_frequency", "tired"].left_out == 0
     told = " ".join(str(study).split())
     assert "it does not describe old1, tired, so the model's numbers of these are left out" in told
+    assert "Table 1 and the measured differences need no model: they stay." in told
+    assert "need no model" not in str(made_study())
     # what is measured is corrected by itself, whatever is compared beside it
     alone = {d.where: d for d in of(made_study(quantities=names[1:]), "groups")}
     for where in CONDITIONS:
@@ -224,10 +235,12 @@ def test_the_folder(tmp_path):
         "table1.csv",
         "people.csv",
         "differences.csv",
+        "trials.csv",
         "study.json",
         "methods.txt",
         "spectra.png",
         "quantities.png",
+        "trials.png",
         "mine.txt",
     }
     with open(tmp_path / "differences.csv", newline="") as file:
@@ -262,9 +275,11 @@ def test_a_study_without_differences_leaves_none_of_an_earlier_one(tmp_path):
     made_study(quantities=["resonance_share"]).save(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {
         "table1.csv",
+        "trials.csv",
         "study.json",
         "methods.txt",
         "spectra.png",
+        "trials.png",
         "mine.csv",
     }
 
@@ -285,24 +300,23 @@ def test_an_interrupted_save_leaves_an_earlier_study_as_it_was(tmp_path, monkeyp
 
 def test_the_figure_of_spectra():
     study = made_study()
-    figure = study.plot(proportional=False)
-    try:
-        assert [ax.get_title(loc="left") for ax in figure.axes] == list(CONDITIONS)
-        assert figure.axes[0].get_ylabel() == "Power (N²/Hz)"
+    cells = [c for c in study.cells if (c.group, c.condition) == ("old", "tired")]
+    # of means of 5 N; where somebody's signal has no mean, shares of power
+    floating = (study.cells[0]._replace(power=None), *study.cells[1:])
+    none = StudyResult(study.cohort, floating, {}, OPTIONS, "s.csv")
+    for one, ordinate, rows in (
+        (study, "Power (1e-6 mean²/Hz)", [c.target.trial_power.mean(axis=0) * 4e4 for c in cells]),
+        (none, "Power (fraction per bin)", [c.target.proportional_power for c in cells]),
+    ):
+        figure = one.plot()
+        titles = [ax.get_title(loc="left") for ax in figure.axes]
+        assert titles == [f"young ({PEOPLE} people)", f"old ({PEOPLE} people)"]
+        assert figure.axes[0].get_ylabel() == ordinate
         legend = [text.get_text() for text in figure.legends[0].get_texts()]
-        assert legend[:2] == [f"young ({PEOPLE} people)", f"old ({PEOPLE} people)"]
-        thick = next(line for line in figure.axes[1].lines if line.get_label().startswith("old"))
-        rows = [
-            c.target.trial_power.mean(axis=0)
-            for c in study.cells
-            if (c.group, c.condition) == ("old", "tired")
-        ]
+        assert legend == [*CONDITIONS, "thick: geometric mean ± SE"]
+        thick = next(line for line in figure.axes[1].lines if line.get_label() == "tired")
         np.testing.assert_allclose(thick.get_ydata(), scipy.stats.gmean(rows), rtol=1e-12)
-    finally:
         plt.close(figure)
-    single = SimpleNamespace(target=SimpleNamespace(trial_power=None, unit="N"))
-    with pytest.raises(ValueError, match="at least two trials"):
-        jm.plot.study(SimpleNamespace(cells=[single]), proportional=False)
 
 
 @pytest.mark.parametrize(
@@ -313,6 +327,7 @@ def test_the_figure_of_spectra():
         ({"alpha": 5.0}, "alpha = 5.0: give a share between 0 and 1"),
         ({"correction": "bonferoni"}, "correction = 'bonferoni': .*holm"),
         ({"quantities": ["tremor"]}, "quantities: unknown 'tremor'; did you mean 'tremor_p'"),
+        ({"conditions": ["rest"]}, r"conditions = \['rest'\]: give all of rest, tired, once"),
     ],
 )
 def test_bad_options(options, message, recorded):
@@ -446,9 +461,60 @@ def test_the_methods_say_what_was_subtracted():
     assert not any(word in study.methods() for word in words)
     force = 3 + np.concatenate([0.001 * np.sin(np.arange(300.0)), forces()[0]])
     target = jm.data.Recording(force, 100.0, unit="N", detrend=True).steady().target("held")
-    cells = (*study.cells, Cell("held", "old", "rest", 1, (100.0,), target))
+    cells = (*study.cells, Cell("held", "old", "rest", read(1), target))
     held = StudyResult(study.cohort, cells, study.aic, study.options, "s.csv")
     assert all(word in held.methods() for word in words)
+
+
+def test_every_recording_is_stated_with_what_was_analysed(recorded, tmp_path):
+    """Part of it given in the table, in the options, or all of it; in the order of the table."""
+    rows = (recorded / "study.csv").read_text().splitlines()
+    edges = [",window_start,window_stop", ",2,9", *(",," for _ in rows[2:])]
+    table = recorded / "windows.csv"
+    table.write_text("\n".join(map(str.__add__, rows, edges)))
+    options = {"rate": 100.0, "units": "N m", "fit": False}
+    for window, whole in ((None, (0.0, 12.0, "all")), ((1, 11), (1.0, 11.0, "given"))):
+        study = jm.run_study(table, window=window, **options)
+        first, *others = [(r["start_s"], r["stop_s"], r["chosen"]) for r in study.trials()]
+        assert first == (2.0, 9.0, "given") and others == [whole] * 15
+    study.save(tmp_path)
+    with open(tmp_path / "trials.csv", newline="") as file:
+        written = list(csv.DictReader(file))
+    assert [row["file"] for row in written] == [f"{i}.npy" for i in range(16)]
+    assert (written[3]["person"], written[3]["condition"], written[3]["trial"]) == (
+        "a",
+        "tired",
+        "2",
+    )
+    assert {row["rate_hz"] for row in written} == {"100"}
+    assert json.loads((tmp_path / "study.json").read_text())["trials"] == study.trials()
+
+
+def test_conditions_and_groups_are_shown_and_compared_as_they_are_asked_for(recorded):
+    order = {"conditions": ["tired", "rest"], "groups": ["y", "x"]}
+    study = jm.run_study(recorded / "study.toml", fit=False, quantities=["mean"], **order)
+    assert study.conditions == ("tired", "rest") and study.groups == ("y", "x")
+    assert [(d.a, d.b) for d in of(study, "conditions")] == [("tired", "rest")]
+    assert {(d.a, d.b) for d in of(study, "groups")} == {("y", "x")}
+    named = list(dict.fromkeys((row["group"], row["condition"]) for row in study.table_1()))
+    assert named == [("y", "tired"), ("y", "rest"), ("x", "tired"), ("x", "rest")]
+    spectra, quantities = (study.figures()[name] for name in ("spectra", "quantities"))
+    assert [ax.get_title(loc="left")[:1] for ax in spectra.axes] == ["y", "x"]
+    assert [text.get_text() for text in quantities.legends[0].get_texts()] == ["tired", "rest"]
+    plt.close("all")
+
+
+def test_names_that_differ_only_as_they_are_typed_are_noticed():
+    study = made_study()
+    assert not [said for said in study_notices(study) if "taken for different" in said]
+    cells = [
+        cell._replace(condition="Tired ")
+        if (cell.person, cell.condition) == ("old1", "tired")
+        else cell
+        for cell in study.cells
+    ]
+    said, *_ = study_notices(StudyResult(study.cohort, tuple(cells), {}, OPTIONS, "s.csv"))
+    assert said.startswith('condition "tired" and "Tired " are taken for different ones')
 
 
 def test_one_chi2_is_stated_everywhere(tmp_path):
@@ -472,7 +538,7 @@ def test_all_recordings_of_a_study_have_one_unit(recorded):
 def test_five_trials_of_everybody_allow_two_resonances(trials, rung, recorded, monkeypatch):
     power = 1 / np.arange(1, 31) ** 2
     cells = [
-        Cell(name, "", "", count, (100.0,) * count, jm.Target(name, power, segments=5))
+        Cell(name, "", "", read(count), jm.Target(name, power, segments=5))
         for name, count in (("a", 7), ("b", trials))
     ]
     asked = []

@@ -386,6 +386,7 @@ def _tasks():
         *(jm.PrescribedForce(noise=noise) for noise in (*noises, jm.WhiteNoise())),
         *(jm.PrescribedMotion(noise=noise) for noise in (noises[0], smooth)),
         _with_everything(),
+        jm.PrescribedLength(reflex=jm.model.Reflex()),
     ]
 
 

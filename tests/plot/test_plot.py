@@ -298,6 +298,9 @@ def result(**changes):
         "stretch": (10 + np.arange(500) / 100, 5 + 0.01 * np.sin(np.arange(500))),
         "recorded": (np.arange(400) / 100, 20 + np.cos(np.arange(400))),
         "stiffness": None,
+        "adequate": True,
+        "parameters": {},
+        "determined": [f"{name}_frequency" for name in ("harmonic", "resonance", "resonance_2")],
     }
     found = Fake(**(fields | changes))
     found.only = found
@@ -373,6 +376,22 @@ def test_the_frequencies_of_resonances_are_marked_in_the_colours_of_their_parts(
     assert not any(label.startswith("regular rhythm") for label in key(figure))
 
 
+def test_a_fit_draws_no_number_that_it_does_not_state():
+    """Of a rhythm whose frequency has no error neither this nor a share; where the model does not
+    describe the data none at all."""
+    some = of_two_resonances(0.2)
+    some.determined = ["resonance_frequency"]
+    assert "second resonance" in key(plot.fit(some))
+    assert "resonance, 20 % (9.22 Hz)" in key(plot.fit(some))
+    some.parameters = {"resonance_2_frequency": Fake(free=False)}
+    assert any(label.endswith("(3.7 Hz)") for label in key(plot.fit(some)))
+    some.adequate = False
+    figure = plot.fit(some)
+    assert not any(sign in label for label in key(figure) for sign in ("%", "Hz"))
+    upright = [line for line in panels(figure)[0].lines if len({*line.get_xdata()}) == 1]
+    assert not upright
+
+
 def test_the_words_below_a_fit_of_two_resonances_find_room_in_its_width():
     figure = plot.fit(of_two_resonances(0.2))
     figure.canvas.draw()
@@ -426,6 +445,8 @@ def test_fit_draws_residuals_in_standard_deviations_and_marks_the_large_ones():
         if line.get_marker() == "o":
             drawn |= {x: (y, line.get_color()) for x, y in line.get_xydata()}
     assert [drawn[x][0] for x in found.frequency_hz] == list(found.residual)
+    large = [line for line in ax.lines if line.get_marker() == "o"][1]
+    assert large.get_markerfacecolor() != large.get_color()  # seen without colours, too
     colours = np.where(np.abs(found.residual) > 2, plot.VERMILLION, plot.BLUE)
     assert [drawn[x][1] for x in found.frequency_hz] == list(colours)
     spans = {(p.get_y(), p.get_y() + p.get_height()) for p in ax.patches}
@@ -544,12 +565,12 @@ def test_steadiness_shows_every_trial_and_the_value_of_all(count):
     figure = plot.steadiness(found)
     figure.canvas.draw()
     _, power, variation, *regularity = figure.axes
-    assert power.get_ylabel() == "Power (%²)" and power.get_yscale() == "log"
+    assert power.get_ylabel() == "Power (1e-6 mean²)" and power.get_yscale() == "log"
     assert [tick.get_text() for tick in power.get_xticklabels()] == ["0", "0.5", "30"]
     words = f"{count} trials, in their order"
     dots = [line for ax in figure.axes for line in ax.lines if line.get_label() == words]
     assert [line.get_ydata().size for line in dots] == ([6, 9, 3, 3, 3] if count > 1 else [])
-    np.testing.assert_allclose(power.containers[0].lines[0].get_ydata(), [1.1e3, 2.1e3])
+    np.testing.assert_allclose(power.containers[0].lines[0].get_ydata(), [1.1e5, 2.1e5])
     np.testing.assert_allclose(variation.containers[0].lines[0].get_ydata(), [31, 41, 51])
     values = [ax.containers[0].lines[0].get_ydata()[0] for ax in regularity]
     np.testing.assert_allclose(values, [0.61, 0.71, 0.81])
@@ -568,9 +589,9 @@ def test_steadiness_shows_the_spectrum_with_its_peak_or_says_that_there_is_none(
     spectrum = figure.axes[0]
     _, each, mean = found.spectrum
     drawn = [line.get_ydata() for line in spectrum.lines[:4]]
-    # in percent of a mean of 4, squared
-    np.testing.assert_allclose(drawn, [*(625 * each), 625 * mean])
-    assert spectrum.get_ylabel() == "Power (%²/Hz)"
+    # over a mean of 4, squared
+    np.testing.assert_allclose(drawn, [*(1e6 / 16 * each), 1e6 / 16 * mean])
+    assert spectrum.get_ylabel() == "Power (1e-6 mean²/Hz)"
     assert list(spectrum.lines[4].get_xdata()) == [9, 9]
     spans = {(p.get_x(), p.get_x() + p.get_width()) for p in spectrum.patches}
     assert spans == {(6, 12), (8.5, 9.4)}
@@ -633,7 +654,9 @@ def test_groups_have_a_mean_spectrum_and_their_numbers():
     assert corner.get_ylabel() == "corner frequency\n(Hz)"
     words = "share of variance, 0.5 to 1\N{NO-BREAK SPACE}Hz (%)"
     assert share.get_ylabel().replace("\n", " ") == words
-    people = [line.get_ydata() for line in corner.lines if line.get_linestyle() == "-"]
+    people = [
+        line.get_ydata() for line in corner.lines if line.get_alpha() and line.get_marker() == "o"
+    ]
     np.testing.assert_array_equal(np.ravel(people), [1, 3, 5, 2, 4, 6])
     means = [container.lines[0].get_ydata()[0] for container in corner.containers]
     np.testing.assert_allclose(means, [3, 4])
@@ -659,15 +682,26 @@ def test_people_who_were_measured_in_several_conditions_are_joined():
     ]
     again = [row for row in again if (row["target"], row["condition"]) != ("p0", "tired")]
     found.table = lambda: again
-    corner, _ = plot.cohort(found, "group").axes
+    p = {("corner_frequency", "rest", "tired"): 0.012}
+    corner, share = plot.cohort(found, "group", p=p).axes
     corner.figure.canvas.draw()
-    assert [tick.get_text() for tick in corner.get_xticklabels()] == ["rest", "tired"] * 2
-    joined = [line.get_ydata() for line in corner.lines if line.get_linestyle() == "-"]
+    assert [tick.get_text() for tick in corner.get_xticklabels()] == ["a", "b"]
+    assert labels_of(corner.figure.legends[0]) == ["rest", "tired"]
+    assert [text.get_text() for text in corner.texts] == ["all people: p = 0.012"]
+    assert not share.texts
+    low, high = corner.get_ylim()
+    assert corner.get_yticks()[0] == low and corner.get_yticks()[-1] == high
+    lines = [line for line in corner.lines if line.get_linestyle() == "-" and line.get_alpha()]
+    joined = [line.get_ydata() for line in lines]
     np.testing.assert_array_equal(joined, [[1, np.nan], [3, 5], [2, 4], [4, 6]])
-    places = [line.get_xdata() for line in corner.lines if line.get_linestyle() == "-"]
+    places = [line.get_xdata() for line in lines]
     assert places[0][1] < places[2][0]  # groups do not overlap
-    # of one person there is no interval
+    # of one person there is no interval; the others do not lie between the ends of lines
     assert len(corner.containers) == 3
+    for i, at in zip(
+        (0, 2, 2), (c.lines[0].get_xdata()[0] for c in corner.containers), strict=True
+    ):
+        assert not places[i][0] <= at <= places[i][1]
 
 
 CELLS = [
@@ -686,7 +720,7 @@ def studied():
         cohort_of(12, groups=CELLS[:2]),
     )
     cells = [
-        Fake(target=result.target, group=people.groups[name], condition=condition)
+        Fake(target=result.target, group=people.groups[name], condition=condition, power=None)
         for name, result in people.results.items()
         for condition in conditions
     ][1:]
@@ -697,33 +731,38 @@ def test_a_study_has_one_key_that_lies_outside_all_spectra():
     figure = plot.study(studied())
     figure.canvas.draw()
     (key,) = figure.legends
-    assert labels_of(key) == [
-        f"{CELLS[0]} (5 to 6 people)",
-        f"{CELLS[1]} (6 people)",
-    ]
+    study = studied()
+    assert labels_of(key) == [*study.conditions, "thick: geometric mean ± SE"]
+    titles = [ax.get_title(loc="left") for ax in figure.axes]
+    assert titles == ["young adults, rested (5…", "older adults, rested (6…"]
     assert not any(key.get_window_extent().overlaps(ax.get_window_extent()) for ax in figure.axes)
-    # what stands lowest in its column
-    assert [bool(ax.get_xlabel()) for ax in figure.axes] == [False, True, True]
+    assert all(ax.get_xlabel() for ax in figure.axes)
+    one = Fake(cells=study.cells[::3], groups=study.groups, conditions=study.conditions[-1:])
+    (panel,) = (figure := plot.study(one)).axes  # of one condition the groups are the colours
+    assert labels_of(figure.legends[0])[:2] == [f"{group} (6 people)" for group in CELLS[:2]]
+    assert panel.get_title(loc="left") == study.conditions[-1][:23] + "…"
 
 
-def test_the_tremor_of_a_person_is_a_dot_on_the_line_of_this_person():
+def test_the_tremor_of_a_person_is_a_mark_above_all_spectra():
     study = studied()
     cell, f = study.cells[-1], study.cells[-1].target.frequency
     tremor = {"tremor_frequency": Measure(9.0, 0.2, "Hz", "trials", (8.5, 9.5))}
     cell.target = Target("shaking", 1 / f, segments=[6], measured=tremor)
     *_, panel = plot.study(study).axes
-    (dot,) = (line for line in panel.lines if line.get_marker() == "o")
-    # between the bins in log power
-    at, own = np.arange(1, 31) / 2.56, cell.target.proportional_power
-    assert dot.get_xdata() == [9.0] and dot.get_color() == plot.VERMILLION
-    assert np.log(dot.get_ydata()[0]) == pytest.approx(np.interp(9.0, at, np.log(own)))
+    (mark,) = (line for line in panel.lines if line.get_marker() == "v")
+    assert list(mark.get_xdata()) == [9.0] and mark.get_color() == plot.GREEN
+    panel.figure.canvas.draw()
+    height = mark.get_transform().transform(mark.get_xydata())[0, 1]
+    lines = [line for line in panel.lines if line.get_marker() != "v" and len(line.get_xdata())]
+    near = [np.interp(9.0, line.get_xdata(), line.get_ydata()) for line in lines]
+    assert height > panel.transData.transform([(9.0, max(near))])[0, 1]
 
 
 def test_a_dollar_in_a_name_is_no_mathematics():
     groups = ["$x_1$ at rest", "b"]
     people = cohort_of(groups=groups, name="$p$")
     cells = [
-        Fake(target=result.target, group=people.groups[name], condition="all")
+        Fake(target=result.target, group=people.groups[name], condition="all", power=None)
         for name, result in people.results.items()
     ]
     study = Fake(cells=cells, groups=groups, conditions=["all"])

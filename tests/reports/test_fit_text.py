@@ -166,10 +166,11 @@ def test_the_methods_paragraph_says_what_a_reader_needs_to_repeat_the_fit():
         "Hann window, 256 samples or 2.56 s, 50 % overlap, mean of each segment removed",
         "from 0.39 to 11.72 Hz",
         "describes the data: chi2 per bin 0.90 (expected 0.86), p = 0.4",
-        "(standard deviations): k_w 5e+05 N/m^3 (1).",
+        # over the mean of 2.5 N of the model, as in its table
+        "(standard deviations): k_w 2e+05 1/m^3 (1).",
         "slow part + twitch + regular rhythm (chi2 per bin 0.90, p = 0.3, AIC -260.0)",
         "Held fixed were",
-        "m_w = 0.5 kg",
+        "m_w = 0.2 kg/N",
         "Software: jaxmuscle 0.1 (The jaxmuscle developers; see its CITATION.cff), jax 0.8",
     ):
         assert words in said, (words, said)

@@ -5,6 +5,7 @@ import sys
 from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 from test_html import HOSTILE, Seen
 from test_result import POWER, failed_result, made_result
@@ -73,6 +74,21 @@ def test_of_a_fit(tmp_path):
     )
 
 
+def test_measured_numbers_of_a_fit_have_words_and_percent(tmp_path):
+    force = 5 + 0.1 * np.random.default_rng(1).standard_normal(3000)
+    target = jm.data.Recording(force, 100.0, unit="N").target("held")
+    fit_report(made_result(target=target), plt.figure(), tmp_path)
+    text = told(tmp_path)[0].partition("What the data determine")[0]
+    for name, words, scale in (
+        ("coefficient_of_variation", "coefficient of variation (% of mean)", 100),
+        ("relative_power_8_12", "power, 8 to 12\N{NO-BREAK SPACE}Hz (1e-6 mean²)", 1e6),
+        ("share_8_12", "share of variance, 8 to 12\N{NO-BREAK SPACE}Hz (%)", 100),
+    ):
+        m = target.measured[name].times(scale)
+        assert f"{words} | {m.in_words()} | {m.interval_in_words()} |" in text
+        assert name not in text
+
+
 def test_one_model_alone_was_not_tried_against_others(tmp_path):
     fit_report(made_result(ladder=()), plt.figure(), tmp_path)
     assert "Models tried" not in told(tmp_path)[0]
@@ -135,7 +151,9 @@ def test_of_a_study(tmp_path):
         cells = [first.quantity, *where, f"{first.b} - {first.a}", number, interval, *p, n]
         row = " | ".join([*cells, str(first.left_out)])
         assert row in text.split(KINDS[kind][0])[1], row
-    assert study.methods() in text and "people.csv and differences.csv" in text
+    assert study.methods() in text and "differences.csv and trials.csv" in text
+    row = "old1 | old, tired | 2 | 2.csv | force | 100 | 1.00 | 9.00 | given"
+    assert "| 40 recordings |" in text and row in text
 
 
 @pytest.mark.parametrize(

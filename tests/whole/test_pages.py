@@ -41,6 +41,7 @@ RUN_HERE = {
     "docs/fit-a-csv.md",
     "docs/fitting.md",
     "docs/force.md",
+    "docs/reflex.md",
     "docs/how-to/own-noise.md",
     "docs/how-to/own-optimiser.md",
     "docs/how-to/report-results.md",

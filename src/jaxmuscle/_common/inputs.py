@@ -45,7 +45,8 @@ def looked_at(
     try:
         found = path.stat()
     except FileNotFoundError:
-        raise error(f"{path}: no such file{hint}") from None
+        folder = "" if path.is_absolute() else f" in {path.parent.absolute()}"
+        raise error(f"{path}: no such file{folder}{hint}") from None
     except (OSError, ValueError) as reason:
         raise error(_unreadable(path, reason)) from None
     if not stat.S_ISREG(found.st_mode):

@@ -41,6 +41,7 @@ from .options import (
     NoiseName,
     Output,
     Quantity,
+    ReflexName,
     Seed,
     Segments,
     TargetTask,
@@ -187,6 +188,16 @@ def fit(
             ),
         ),
     ] = False,
+    reflex: Annotated[
+        ReflexName | None,
+        typer.Option(
+            help=(
+                "Of a moved limb: whether a stretch reflex is looked for beside the muscle, and"
+                " fitted if it is seen (auto, the default), left out (none), or fitted in any case"
+                " (linear)."
+            )
+        ),
+    ] = None,
     output: Output = Path("out"),
     formats: Formats = None,
     force: Force = False,
@@ -285,7 +296,7 @@ def fit(
                 " them out"
             )
         if hold:
-            _check_hold(method, options["fix"], task, quantity)
+            _check_hold(method, options["fix"], task, quantity, reflex)
             most = 0 if rung is not None or noise is not None or options["free"] else RUNGS
             options |= {
                 "rungs": most if rungs is None else rungs,
@@ -308,6 +319,7 @@ def fit(
                 "seeds": seeds,
                 "rungs": rungs if rung is None else 0,
             }
+            options |= {"reflex": str(reflex)} if reflex is not None else {}
             options |= {"check_seeds": 0} if quick else {}
             seen, model = (
                 _aim_at_recordings(
@@ -371,9 +383,15 @@ def _check_rung(
 
 
 def _check_hold(
-    method: MethodName, fixed: dict[str, float], task: str | None, quantity: str | None
+    method: MethodName,
+    fixed: dict[str, float],
+    task: str | None,
+    quantity: str | None,
+    reflex: str | None,
 ) -> None:
     """Raise a `ValueError` for an option that does not go with --hold."""
+    if reflex is not None:
+        raise ValueError("--reflex: with --hold none is looked for yet; leave it out")
     if method != MethodName.linear:
         raise ValueError(
             "with --hold all records are fitted by the formula of the spectrum: leave out --method"

@@ -20,6 +20,12 @@ class MethodName(StrEnum):
     montecarlo = "montecarlo"
 
 
+class ReflexName(StrEnum):
+    auto = "auto"
+    none = "none"
+    linear = "linear"
+
+
 class Increments(StrEnum):
     gaussian = "gaussian"
     weak = "weak"
@@ -142,6 +148,13 @@ Mvc = Annotated[
             "Maximal voluntary contraction, in the unit of the recording and counted from rest;"
             " gives the level in % MVC."
         ),
+    ),
+]
+Quantities = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAMES",
+        help="Quantities of a study that are compared; put commas between names.",
     ),
 ]
 Window = Annotated[

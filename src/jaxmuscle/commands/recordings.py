@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jaxmuscle as jm
+from jaxmuscle._common.inputs import looked_at
 from jaxmuscle._common.units import NEWTONS
 
 from .console import say_notice
@@ -260,9 +261,13 @@ def require_files(names: Sequence[str]) -> None:
     for name in names:
         path = Path(name).expanduser()
         if path.is_dir() and name not in jm.list_targets():
-            raise ValueError(f"{name}: is a folder; give the files in it, as {path / '*.csv'}")
-        if path.suffix and not path.exists():
-            raise ValueError(f"{name}: no such file")
+            raise ValueError(
+                f"{name}: is a folder; give the files in it that are trials of one person in one"
+                f" condition, as {path / '*.csv'}. Of several people: a table of them for jaxmuscle"
+                " study (docs/study.md)"
+            )
+        if path.suffix:
+            looked_at(path)
 
 
 def windows_of(window: str | None, recordings: int) -> list[Any]:

@@ -8,8 +8,20 @@ import typer
 import jaxmuscle as jm
 
 from .console import out, plain_lines, record, reporting, say_written, writable
-from .options import Force, Formats, Json, Mvc, Output, Recordings, Window, band_of, formats_of
-from .recordings import read_trials, reads_recordings
+from .options import (
+    Force,
+    Formats,
+    Json,
+    Mvc,
+    Output,
+    Quantities,
+    Recordings,
+    Window,
+    band_of,
+    formats_of,
+    names_in,
+)
+from .recordings import read_trials, reads_recordings, require_files
 from .study import measured_study, write_study
 
 
@@ -29,6 +41,7 @@ def steadiness(
         ),
     ] = None,
     mvc: Mvc = None,
+    quantities: Quantities = None,
     output: Output = Path("out"),
     formats: Formats = None,
     force: Force = False,
@@ -67,9 +80,15 @@ def steadiness(
                 )
             if mvc is not None:
                 raise ValueError("--mvc: of a study give the column mvc in its table")
-            found = measured_study(paths[0], window, reading, output, force=force)
+            compared = names_in(quantities, "--quantities")
+            found = measured_study(paths[0], window, compared, reading, output, force=force)
             write_study(found, output, formats_of(formats))
             return
+        if quantities is not None:
+            raise ValueError(
+                "--quantities: is for the table of a study; of recordings all are printed"
+            )
+        require_files(paths)
         from jaxmuscle._common.figures import write_figure
         from jaxmuscle._common.files import write_text
         from jaxmuscle._common.tables import csv_of

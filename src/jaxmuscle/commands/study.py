@@ -26,6 +26,7 @@ from .options import (
     Json,
     NoiseName,
     Output,
+    Quantities,
     Seed,
     SpectrumName,
     Window,
@@ -68,12 +69,7 @@ def study(
             help="How spectra are estimated, as in `jaxmuscle analyse`; the same for all."
         ),
     ] = None,
-    quantities: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAMES", help="Quantities that are compared; put commas between names."
-        ),
-    ] = None,
+    quantities: Quantities = None,
     alpha: Annotated[
         float | None,
         typer.Option(help="Level of the tests, 0.05 by default; intervals are those of 1 - alpha."),
@@ -99,8 +95,8 @@ def study(
     The table has a line for each recording. It needs the columns file and person, and may have
     group, condition and trial. The trials of a person in a condition are averaged. Options such as
     --column say how files are read. A column of the same name in the table has priority. Writes
-    DIR/table1.csv, people.csv, differences.csv, study.json, spectra.png, quantities.png,
-    methods.txt and report.html, all at the end.
+    DIR/table1.csv, people.csv, differences.csv, trials.csv, study.json, spectra.png,
+    quantities.png, trials.png, methods.txt and report.html, all at the end.
 
     Examples:
 
@@ -147,23 +143,36 @@ def write_study(found: "StudyResult", output: Path, formats: list[str]) -> None:
 
 
 def measured_study(
-    table: str, window: str | None, reading: dict[str, Any], output: Path, *, force: bool
+    table: str,
+    window: str | None,
+    quantities: list[str] | None,
+    reading: dict[str, Any],
+    output: Path,
+    *,
+    force: bool,
 ) -> "StudyResult":
     """A study without any model."""
     span = edges_of(window)
     _writable(output, table, force=force)
-    return jm.run_study(table, fit=False, progress=True, window=span, **_given(reading))
+    return jm.run_study(
+        table,
+        fit=False,
+        quantities=quantities,
+        progress=True,
+        window=span,
+        **_given(reading),
+    )
 
 
 def _writable(output: Path, table: str | Path, *, force: bool) -> None:
     from jaxmuscle.reports import REPORT
 
-    beside = ["table1.csv", "people.csv", "differences.csv", "methods.txt", REPORT]
+    beside = ["table1.csv", "people.csv", "differences.csv", "trials.csv", "methods.txt", REPORT]
     writable(
         output,
         "study.json",
         beside=beside,
-        figures=["spectra", "quantities"],
+        figures=["spectra", "quantities", "trials"],
         reads=jm.data.files_of_study(table),
         force=force,
     )

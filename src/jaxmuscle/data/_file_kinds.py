@@ -81,7 +81,8 @@ def _kind_of_text(begin: bytes, ending: str) -> Kind:
         return "spectrum" if table else "recording"
     delimiter = delimiter_in(rows[0])
     names = [cell.casefold() for cell in cells_of(rows[0], delimiter)]
-    if {*STUDY} <= {*names}:
+    second = cells_of(rows[1], delimiter) if len(rows) > 1 else []
+    if {*STUDY} <= {*names} or _names_files(names, second):
         return "study"
     roles = {match[1] for name in names if (match := HEADER.fullmatch(name))}
     responds = {"gain", "phase"} <= roles and not roles.isdisjoint(("frequency", "freq", "f"))
@@ -93,10 +94,17 @@ def _kind_of_text(begin: bytes, ending: str) -> Kind:
     spectral = {column_role(name)[0] for name in names} >= {*NAMES[:2]} or any(
         name.startswith(("freq", "proportional", "power")) for name in names
     )
-    second = cells_of(rows[1], delimiter) if len(rows) > 1 else []
     if table:
         figure = {cell.casefold() for cell in second} == {"x", "y"}
         return "spectrum" if spectral or figure or len(rows) <= ROWS else "recording"
     # above the columns of a laboratory's text may stand a line "Frequency: 1000"
     spectral = spectral and len(names) > 1 and all(is_number(cell, delimiter) for cell in second)
     return "spectrum" if spectral else "recording"
+
+
+def _names_files(names: Sequence[str], cells: Sequence[str]) -> bool:
+    """Whether a column called file holds one, though the person may be called otherwise."""
+    if STUDY[0] not in names or len(cells) != len(names):
+        return False
+    cell = cells[names.index(STUDY[0])]
+    return Path(cell).suffix[1:].isalnum() and not is_number(cell, None)

@@ -45,6 +45,8 @@ SEGMENTS = 2  # a steady part holds at least this many
 SHORTEST = (RECORDED.length + (SEGMENTS - 1) * RECORDED.step) / RECORDED.rate  # s, which these take
 DRIFT = 0.5  # share of the variance
 UNLIKE = 1.1  # ratio of the means of two trials
+APART = 3.0  # standard deviations within, by which means of one person and condition hardly differ
+SEVERAL = " If these are several people or conditions, write a table (docs/study.md)"
 UNRAMPED = "steady part: no ramp found, so all of the recording is used"
 BURST = "the force leaves its level"
 FOUND = "steady part found automatically: "
@@ -628,10 +630,11 @@ def unlike(names: Sequence[str], signals: Sequence[np.ndarray], unit: str) -> tu
     means = {abs(float(np.mean(x))): name for x, name in zip(signals, names, strict=True)}
     low, high = min(means), max(means)
     if high > UNLIKE * low:
+        far = high - low > APART * max(float(np.std(x)) for x in signals)
         said.append(
             f"the means of the trials reach from {low:.4g} {unit} ({means[low]}) to"
             f" {high:.4g} {unit} ({means[high]}): are they of one condition, and did the"
-            " person tire?"
+            f" person tire?{SEVERAL * far}"
         )
     return tuple(said)
 

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
+from jaxtyping import Float
 from msgspec import Meta
 
 from jaxmuscle._common.arguments import is_real, require
@@ -22,6 +24,7 @@ from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import NAMED
 
 from ._file_kinds import STUDY
+from ._recording import FOUND, Recording
 from ._recording_choice import Reading
 from ._recording_files import load_recording
 from ._target import Target
@@ -38,7 +41,9 @@ NUMBERS = ("rate", "max_gap", "lever_arm", "skip_rows", "mvc", *EDGES)
 ANSWERS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 COLUMNS = (*LABELS, *FILES, *SPECTRA, *EDGES)
 READING = (*FILES, *SPECTRA, "window")
-OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction")
+ORDERS = ("groups", "conditions")
+OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction", *ORDERS)
+BITS = 200  # of a recording in a small figure
 
 
 # what a key may hold where it may also be missing
@@ -226,14 +231,26 @@ class StudyFile(ReadingTable, kw_only=True):
     correction: Annotated[
         Text, says("Correction for many comparisons: holm, fdr or none", missing="holm")
     ] = None
+    groups: Annotated[
+        list[str] | None,
+        says(
+            "All groups, in the order in which they are shown and compared (second less first)",
+            missing="as the table first names them",
+        ),
+    ] = None
+    conditions: Annotated[
+        list[str] | None,
+        says("All conditions, in their order", missing="as the table first names them"),
+    ] = None
 
 
 class Row(NamedTuple):
-    """A recording of a study: `place`, what an error calls it; whose it is; `reading`, how the file
-    is read."""
+    """A recording of a study: `place`, what an error calls it; its `file`, and as the table has
+    `named` it; whose it is; `reading`, how the file is read."""
 
     place: str
     file: Path
+    named: str
     person: str
     group: str
     condition: str
@@ -251,15 +268,41 @@ class StudyTable(NamedTuple):
     files: tuple[Path, ...] = ()
 
 
+class Trial(NamedTuple):
+    """What was analysed of a recording: which `column` of which `file`, as the table names it; its
+    `rate` [Hz]; the part from `start` to `stop` [s], which is `chosen` as "found", "given" or
+    "all".
+
+    `time` [s] and `signal` are the least and the greatest of every bit of the whole recording, for
+    a small figure.
+    """
+
+    file: str
+    trial: str
+    column: str
+    rate: float
+    start: float
+    stop: float
+    chosen: str
+    time: Float[np.ndarray, " bits"]
+    signal: Float[np.ndarray, " bits"]
+
+
 class Cell(NamedTuple):
-    """One person in one condition: how many `trials`, at which `rates` [Hz], and their `target`."""
+    """One person in one condition: the `recordings`, the `target` that they make, and the `power`
+    of this in each bin over the squared mean [1/Hz], None where a mean says nothing."""
 
     person: str
     group: str
     condition: str
-    trials: int
-    rates: tuple[float, ...]
+    recordings: tuple[Trial, ...]
     target: Target
+    power: Float[np.ndarray, " bins"] | None = None
+
+    @property
+    def trials(self) -> int:
+        """How many recordings."""
+        return len(self.recordings)
 
 
 def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") -> StudyTable:
@@ -304,7 +347,7 @@ def files_of_study(path: str | os.PathLike[str]) -> list[Path]:
     return [*found.files, *(row.file for row in found.rows)]
 
 
-class _Trial(NamedTuple):
+class _Asked(NamedTuple):
     """A recording of a cell: its row, how its file is read, in which window."""
 
     row: Row
@@ -315,7 +358,7 @@ class _Trial(NamedTuple):
 class _Wanted(NamedTuple):
     """What makes a cell: its trials, the settings of their spectra, the mvc."""
 
-    trials: tuple[_Trial, ...]
+    trials: tuple[_Asked, ...]
     settings: str
     mvc: float | None
 
@@ -333,7 +376,7 @@ def cells_of_study(
     a spectrum or a unit that is not that of the others, and of an mvc that is not that of the same
     person in the same condition.
     """
-    together: dict[tuple[str, str, str], list[_Trial]] = defaultdict(list)
+    together: dict[tuple[str, str, str], list[_Asked]] = defaultdict(list)
     stated: dict[Any, tuple[Row, Any]] = {}
 
     def as_before(row: Row, key: Any, name: str, value: Any, remedy: str) -> None:
@@ -356,7 +399,7 @@ def cells_of_study(
             as_before(row, whose, "mvc", mvc, remedy)
         # a worker may be in another folder
         there = row if executor is None else row._replace(file=row.file.absolute())
-        together[whose].append(_Trial(there, reading, window))
+        together[whose].append(_Asked(there, reading, window))
     wanted = [
         _Wanted(tuple(trials), stated["spectrum"][1], stated[whose][1])
         for whose, trials in together.items()
@@ -390,10 +433,28 @@ def _cell(wanted: _Wanted) -> tuple[list[str], Any]:
                 recordings[i] = recordings[i].steady(window)
         name = ", ".join(filter(None, (first.person, first.condition)))
         with _named(f"{first.place}: {name}"):
-            target = Trials(recordings).target(name, mvc=wanted.mvc, settings=wanted.settings)
-    rates = tuple(recording.rate for recording in recordings)
-    whose = first.person, first.group, first.condition
-    return units, Cell(*whose, len(recordings), rates, target)
+            trials = Trials(recordings)
+            target = trials.target(name, mvc=wanted.mvc, settings=wanted.settings)
+        power = None
+        if target.mean is not None:
+            power = np.asarray(trials.spectrum(wanted.settings).power) / np.mean(target.mean) ** 2
+    read = (_analysed(r, a) for r, a in zip(recordings, wanted.trials, strict=True))
+    return units, Cell(first.person, first.group, first.condition, tuple(read), target, power)
+
+
+def _analysed(recording: Recording, asked: _Asked) -> Trial:
+    """What was analysed of a recording, and a small picture of it."""
+    start, stop = recording.window or (recording.start, recording.stop)
+    found = any(notice.startswith(FOUND) for notice in recording.notices)
+    chosen = "found" if found else "all" if asked.window in (None, "all") else "given"
+    # "trial.csv, column force, 1000 Hz"
+    column = recording.source.removeprefix(f"{asked.row.file.name}, ").rpartition(", ")[0]
+    column = column.removeprefix("column ")
+    edges = np.linspace(0, recording.whole.size, BITS + 1).astype(int)[:-1]
+    signal = np.stack([f.reduceat(recording.whole, edges) for f in (np.minimum, np.maximum)])
+    time = recording.start + np.repeat(edges, 2) / recording.rate
+    whose = asked.row.named, asked.row.trial, column
+    return Trial(*whose, recording.rate, start, stop, chosen, time, signal.T.ravel())
 
 
 @contextlib.contextmanager
@@ -413,16 +474,17 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
     (head, *body), found = lines, []
     delimiter = delimiter_in(head.body) or ","
     names, place = [n.casefold() for n in cells_of(head.body, delimiter)], f"{path}: {head.place}"
+    for name in STUDY:
+        if name not in names:
+            others = ", ".join(other for other in names if other not in COLUMNS)
+            raise ValueError(
+                f"{place}: needs a column {name}{f' (found: {others})' * bool(others)}; the header"
+                f" has file and person, and may have {', '.join(COLUMNS[2:])}"
+            )
     for name in names:
         _check_column(name, place)
         if names.count(name) > 1:
             raise ValueError(f"{place}: two columns are called {name}: leave one out")
-    for name in STUDY:
-        if name not in names:
-            raise ValueError(
-                f"{place}: no column {name}; the header needs file and person, and may"
-                f" have {', '.join(COLUMNS[2:])}"
-            )
     for line in body:
         cells, place = cells_of(line.body, delimiter), f"{path}: {line.place}"
         if len(cells) != len(names):
@@ -508,5 +570,5 @@ def _row(place: str, given: dict[str, Any], folder: Path) -> Row:
     reading = {name: filled[name] for name in (*FILES, *SPECTRA) if name in filled}
     if None not in window:
         reading["window"] = window
-    _, person, group, condition, trial = texts.values()
-    return Row(place, file, person, group, condition, trial, reading)
+    named, person, group, condition, trial = texts.values()
+    return Row(place, file, named, person, group, condition, trial, reading)

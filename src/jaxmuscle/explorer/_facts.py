@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import NOISES
-from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE, Parameter
+from jaxmuscle.model._parameters import PARAMETERS, REFLEX, USUALLY_FREE, Parameter
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._task_tables import task_to_table
@@ -34,7 +34,8 @@ def facts() -> dict[str, Any]:
     }
     richest = on_rung(Isometric(), 3)
     return {
-        "parameters": {name: parameter(row) for name, row in PARAMETERS.items()},
+        # the page shows spectra of a held muscle, on which a reflex does nothing
+        "parameters": {n: parameter(row) for n, row in PARAMETERS.items() if n not in REFLEX},
         "usually_free": list(USUALLY_FREE),
         "tasks": {name: bare_table(task) for name, task in tasks.items()},
         "noises": {name: noise_table(noise) for name, noise in kinds.items()},

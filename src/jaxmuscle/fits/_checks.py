@@ -360,7 +360,9 @@ def reach_notices(
         if base_of(name) != "tangent_stiffness" or p.stderr is None:
             continue
         for part in (part for key, part in parts.items() if name.partition("@")[2] in ("", key)):
-            if part.stiffness is None or part.target.stiffness is None:
+            # a reflex, too, changes what is seen there
+            reflex = "reflex_gain" in part.task.parameter_names
+            if part.stiffness is None or part.target.stiffness is None or reflex:
                 continue
             known = part.target.stiffness.known
             seen = np.flatnonzero(np.abs(part.stiffness) > CLEAR * known.stderr)

@@ -14,6 +14,7 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._rungs import QUIET, RUNGS, is_base, on_rung
 from jaxmuscle.model._task import AbstractTask, require_task
+from jaxmuscle.model._tasks import PrescribedLength
 from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import Plan, at_mean, planned
 from jaxmuscle.objective._options import FitOptions, JointFitOptions, OneFitOptions
@@ -21,6 +22,7 @@ from jaxmuscle.objective._options import FitOptions, JointFitOptions, OneFitOpti
 from ._joint import fit_jointly
 from ._model_choice import Models, first_rung, options_for
 from ._perturbed import ANEW, alike, analysed, recordings_of, seen_with, without_rhythm
+from ._reflex import planned_with_reflex
 from ._result import FitResult
 from ._search import search
 
@@ -102,6 +104,8 @@ def fit(
     - `progress`: True or a function of (text, share)
     - `rungs`: how many richer models may be tried where the spectrum shows a tremor, or the base
       model does not describe the data (`on_rung`; 3, or 0 where `noise` or `free` is given)
+    - `reflex`: of a moved record, whether a stretch reflex beside the muscle is looked for, and
+      fitted if it is seen ("auto"), left out ("none") or fitted in any case ("linear")
     - `answer`: a function that gets the result as soon as the search ends: with the verdict, before
       the simulated check, and before profile and p-value of the harmonic
 
@@ -166,7 +170,8 @@ def fit(
         top = _top(task, target, given)
         models = _models(task, target, given, top, recordings)
         plan = models.plan_at(models.first)
-        return search(plan, answer, models if top > models.lowest else None)
+        several = top > models.lowest or models.with_reflex is not None
+        return search(plan, answer, models if several else None)
 
 
 def _models(
@@ -195,8 +200,28 @@ def _models(
         again = seen_with(muscles[0], recordings)
         return None if alike(target, again) else _models(task, again, given, top, recordings)
 
+    def with_reflex(number: int, seen_by: AbstractTask | None) -> Plan:
+        own = quiet if number == QUIET else on_rung(base, number) if number else base
+        aim = target if seen_by is None or not recordings else seen_with(seen_by, recordings)
+        return planned_with_reflex(own, aim.with_measures(), options_for(own, options))
+
     first = first_rung([target], lowest, top) if top > lowest else lowest
-    return Models(first, lowest, top, plan_at, renewed if recordings else None)
+    possible = target.stiffness is not None and not unknown and options.method == "linear"
+    possible = possible and type(base) is PrescribedLength and base.reflex is None
+    require(
+        possible or options.reflex != "linear",
+        "reflex = 'linear': a reflex is fitted to a recording of a moved limb or to its response,"
+        " with a PrescribedLength without one, by the formula. Leave it out",
+    )
+    return Models(
+        first,
+        lowest,
+        top,
+        plan_at,
+        renewed if recordings else None,
+        with_reflex if possible and options.reflex != "none" else None,
+        options.reflex,
+    )
 
 
 def _top(task: AbstractTask, target: Target, options: FitOptions) -> int:

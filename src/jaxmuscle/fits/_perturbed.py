@@ -66,6 +66,9 @@ def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) ->
     def stiffness(f: np.ndarray) -> np.ndarray:
         return np.asarray(dynamic_stiffness(muscle, f))
 
+    if muscle.reflex is not None:  # a delay is known to the linear response only
+        return perturbed_target(recordings, stiffness)
+
     def predicted(motion: np.ndarray, interval: float) -> np.ndarray:
         return driven(muscle, -motion, interval)
 

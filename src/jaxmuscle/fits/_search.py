@@ -18,18 +18,25 @@ from jaxmuscle._common.executors import AnyExecutor, results_of
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle._common.progress import nothing
 from jaxmuscle.ensembles._ensemble import runs_for_means
+from jaxmuscle.model._rungs import REFLEX
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan
 from jaxmuscle.objective._consequences import BATCH
 from jaxmuscle.objective._least_squares import Minima, least_squares
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.objective._residuals import Residuals
-from jaxmuscle.objective._starts import contenders, kinds_of_starts, recombined, starting_points
+from jaxmuscle.objective._starts import (
+    contenders,
+    kinds_of_starts,
+    recombined,
+    starting_points,
+)
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
 from ._checks import AMBIGUOUS
 from ._model_choice import Climbed, Models, climb, rung_of
+from ._reflex import ReflexTest, look_for_reflex, starts_with_reflex
 from ._report import UNCHECKED, report_fit
 from ._result import FitResult, Rung
 from ._stages import Stage, controlled_moments, expand_at_best
@@ -82,6 +89,7 @@ class _Search:
     known: "Known | None" = None
     ladder: tuple[Rung, ...] = ()
     best: Climbed | None = None
+    reflex: ReflexTest | None = None
 
     def keep(self, found: Climbed) -> None:
         """Go on from this model."""
@@ -98,6 +106,7 @@ class _Search:
         problem = self.plan.problem
         if models is not None:
             self.climb(models)
+            self.look_for_reflex(models)
             return
         points = starting_points(problem, self.plan.starts)
         kinds = kinds_of_starts(problem, self.plan.starts)
@@ -128,6 +137,40 @@ class _Search:
             self.ladder, models = tried, anew
             self.keep(better[-1])
 
+    def look_for_reflex(self, models: Models) -> None:
+        """Test the best model for a reflex that it lacks, and go on with one that is seen; of
+        recordings a second time, with the target that muscle and reflex see."""
+        found = self.best
+        test = None if found is None else look_for_reflex(found.ended)
+        if found is None or test is None or models.with_reflex is None:
+            return
+        self.reflex = test
+        if not test.seen and models.reflex != "linear":
+            return
+        muscle, number = None, found.rung.number
+        for _ in range(1 + (models.renewed is not None)):
+            plan = models.with_reflex(number, muscle)
+            known = dict(zip(self.plan.problem.coordinates.names, self._values(), strict=True))
+            points, kinds = starts_with_reflex(plan.problem, known, test)
+            stages: list[Stage] = []
+            plan = plan._replace(kinds=kinds)
+            reached = _descended(plan, points, stages)
+            if reached is None:
+                return
+            ended = Endpoint.of(plan.problem, stages[-1])
+            rung = rung_of(ended, number)
+            name = f"{rung.model} + {REFLEX}"
+            rung = msgspec.structs.replace(rung, model=name, chosen=True)
+            self.keep(Climbed(plan, stages, reached, ended, rung))
+            muscle = _reached(plan, stages)[0]
+        without = [msgspec.structs.replace(r, chosen=False) for r in self.ladder]
+        self.ladder = (*without, self.best.rung) if self.best is not None else self.ladder
+
+    def _values(self) -> list[float]:
+        """The free parameters of the best point."""
+        c, found = self.plan.problem.coordinates, self.stages[-1].minima
+        return c.values_of(np.asarray(c.theta(found.s[found.best]))[None])[0].tolist()
+
 
 def search(
     plan: Plan, answer: Callable[[FitResult], None] | None = None, models: Models | None = None
@@ -156,6 +199,9 @@ def search(
             "checking with new simulations" if plan.check_seeds else "computing the errors", 0.8
         )
         result = report_fit(plan, run.stages, run.ladder, ended=ended)
+        if run.reflex is not None and not run.reflex.seen:
+            said = (run.reflex.notice, *result.notices)
+            result = dataclasses.replace(result, notices=said)
         if answer is not None and not plan.check_seeds:
             answer(result)
     except KeyboardInterrupt:

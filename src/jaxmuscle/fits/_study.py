@@ -30,7 +30,7 @@ from jaxmuscle._common.types import Key
 from jaxmuscle._common.upward import load_above
 from jaxmuscle.data._measured import MEASURES
 from jaxmuscle.data._recording_choice import ReadingOptions
-from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_study
+from jaxmuscle.data._study_table import ORDERS, READING, Cell, cells_of_study, read_study
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._derived import DERIVED
@@ -45,7 +45,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 AUTO = "auto"
-USUAL = {"rung": None, "noise": None, "quantities": None, "alpha": 0.05, "correction": "holm"}
+USUAL = {
+    "rung": None,
+    "noise": None,
+    "quantities": None,
+    "alpha": 0.05,
+    "correction": "holm",
+    **dict.fromkeys(ORDERS),
+}
 FORMAT = 2
 # What is compared: measured quantities, and the frequencies of the model's two resonances.
 MEASURED = (
@@ -70,9 +77,9 @@ Numbers = Mapping[Whose, Number | None]
 class StudyResult(Result, eqx.Module):
     """What a study found.
 
-    `cells`, one for each person in each condition: `person`, `group`, `condition`, how many
-    `trials`, their sampling `rates` [Hz], and the `target` made of them, whose `measured` is what
-    needs no model; `cohort`, the fits, one of each cell, none where only measured was asked for;
+    `cells`, one for each person in each condition: `person`, `group`, `condition`, the
+    `recordings` (rows of `trials`), and the `target` made of them, whose `measured` is what needs
+    no model; `cohort`, the fits, one of each cell, none where only measured was asked for;
     `aic`, the summed AIC of every model that was tried (by rung), of which the lowest was taken;
     the `options` as they were used; the `source` of the table.
     """
@@ -101,13 +108,16 @@ class StudyResult(Result, eqx.Module):
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The groups, in the order of the table."""
-        return tuple(dict.fromkeys(cell.group for cell in self.cells))
+        """The groups, as `options` orders them, else the table."""
+        return self._ordered("groups", (cell.group for cell in self.cells))
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """The conditions, in the order of the table."""
-        return tuple(dict.fromkeys(cell.condition for cell in self.cells))
+        """The conditions, as `options` orders them, else the table."""
+        return self._ordered("conditions", (cell.condition for cell in self.cells))
+
+    def _ordered(self, what: str, names: Iterable[str]) -> tuple[str, ...]:
+        return tuple(dict.fromkeys([*(self.options.get(what) or ()), *names]))
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -202,6 +212,27 @@ class StudyResult(Result, eqx.Module):
             ]
         return [row for row in rows if asked is None or row["quantity"] in asked]
 
+    def trials(self) -> list[dict[str, Any]]:
+        """What was analysed of every recording: rows `person`, `group`, `condition`, `trial`,
+        `file`, `column`, `rate_hz`, `start_s` and `stop_s` of the part, and how this was `chosen`
+        ("found" as the steady part, "given", "all")."""
+        return [
+            {
+                "person": cell.person,
+                "group": cell.group,
+                "condition": cell.condition,
+                "trial": r.trial,
+                "file": r.file,
+                "column": r.column,
+                "rate_hz": r.rate,
+                "start_s": r.start,
+                "stop_s": r.stop,
+                "chosen": r.chosen,
+            }
+            for cell in self.cells
+            for r in cell.recordings
+        ]
+
     def to_dataframe(self) -> "pandas.DataFrame":
         """The rows of `table`."""
         return frame(self.table())
@@ -260,22 +291,30 @@ class StudyResult(Result, eqx.Module):
         statistics, versions."""
         return load_above("reports").study_methods(self)
 
-    def plot(self, ax: "Axes | None" = None, *, proportional: bool = True) -> "Figure | SubFigure":
-        """Spectra of people and means of groups, a panel for each condition; see
+    def plot(self, ax: "Axes | None" = None, *, proportional: bool = False) -> "Figure | SubFigure":
+        """Spectra of people and means of conditions, a panel for each group; see
         `jaxmuscle.plot.study`."""
         return plot.study(self, ax, proportional=proportional)
 
     def figures(self) -> dict[str, Any]:
-        """`spectra`, as `plot` draws them, and `quantities`, what is compared; not these where
-        nothing is known of half of the people."""
+        """`spectra`, as `plot` draws them; `quantities`, what is compared, not these where nothing
+        is known of half of the people; `trials`, every recording with the part that was
+        analysed."""
         found = {"spectra": self.plot()}
+        p = {
+            (d.quantity, d.a, d.b): d.p_corrected
+            for d in self.differences()
+            if d.kind == "conditions"
+        }
         with contextlib.suppress(ValueError):
-            found["quantities"] = plot.cohort(self._drawn(), "group", quantities=self.quantities)
-        return found
+            found["quantities"] = plot.cohort(
+                self._drawn(), "group", quantities=self.quantities, p=p
+            )
+        return found | {"trials": plot.study_trials(self)}
 
     def save(self, folder: str | os.PathLike[str], formats: Sequence[str] = ("png",)) -> None:
-        """Write table1.csv, people.csv, differences.csv, study.json, spectra.png, quantities.png
-        and methods.txt into `folder`.
+        """Write table1.csv, people.csv, differences.csv, trials.csv, study.json, spectra.png,
+        quantities.png, trials.png and methods.txt into `folder`.
 
         They are made beside it first and then moved: a save that is interrupted changes nothing.
         Without a comparison there is no differences.csv. `formats` of the figures: "png", "pdf",
@@ -288,7 +327,7 @@ class StudyResult(Result, eqx.Module):
             self._write(new, formats)
             remove(folder, *FILES)
             # an earlier study may have had more of them
-            remove_figures(folder, "spectra", "quantities")
+            remove_figures(folder, "spectra", "quantities", "trials")
             for path in sorted(new.iterdir()):
                 os.replace(path, folder / path.name)
 
@@ -297,6 +336,7 @@ class StudyResult(Result, eqx.Module):
             "table1.csv": self.table_1(),
             "people.csv": self.table(),
             "differences.csv": [_row(d) for d in self.differences()],
+            "trials.csv": self.trials(),
         }
         for name, rows in tables.items():
             if rows:
@@ -310,6 +350,7 @@ class StudyResult(Result, eqx.Module):
         """What the figure of the quantities shows."""
         known = self._known()
         groups = {cell.target.name: cell.group for cell in self.cells}
+        in_order = sorted(self.cells, key=lambda cell: self.conditions.index(cell.condition))
         rows = [
             {
                 "target": cell.target.name,
@@ -321,16 +362,17 @@ class StudyResult(Result, eqx.Module):
                 "stderr": e.stderr,
                 "unit": e.unit,
             }
-            for cell in self.cells
+            for cell in in_order
             for name, e in known[cell.person, cell.condition].items()
         ]
-        return _Drawn({cell.target.name: cell for cell in self.cells}, groups, rows)
+        by_group = sorted(self.cells, key=lambda cell: self.groups.index(cell.group))
+        return _Drawn({cell.target.name: cell for cell in by_group}, groups, rows)
 
     def _card(self) -> Card:
         return load_above("reports").study_card(self)
 
 
-FILES = ("table1.csv", "people.csv", "differences.csv", "study.json", "methods.txt")
+FILES = ("table1.csv", "people.csv", "differences.csv", "trials.csv", "study.json", "methods.txt")
 
 
 class _Drawn(NamedTuple):
@@ -381,6 +423,7 @@ def to_table(study: StudyResult) -> dict[str, Any]:
         "table_1": study.table_1(),
         "fits": [_fit_to_table(cell, study.cohort) for cell in study.cells],
         "differences": [_row(d) for d in study.differences()],
+        "trials": study.trials(),
         "methods": study.methods(),
         "versions": versions(),
     }
@@ -393,7 +436,6 @@ def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
         "person": cell.person,
         "group": cell.group,
         "condition": cell.condition,
-        "rates_hz": cell.rates,
         "segments": target.segments or (),
         "source": target.source,
         "notices": target.notices,
@@ -424,6 +466,8 @@ class StudyOptions(ReadingOptions, total=False):
     quantities: Iterable[str] | None
     alpha: float | None
     correction: str | None
+    groups: Sequence[str] | None
+    conditions: Sequence[str] | None
     window: Sequence[float | int] | str | None
     skip_rows: int | None
     sheet: str | int | None
@@ -474,6 +518,8 @@ def run_study(
     - `correction` for many comparisons: "holm" (default), "fdr" or "none". All comparisons of one
       kind (groups, conditions, interaction) are corrected together, measured quantities and those
       of the model apart.
+    - `groups`, `conditions`: all of them, in the order in which they are shown and compared (the
+      second less the first); by default as the table first names them.
     - `progress`: True or a function of (text, share).
     - `executor`: who reads the files and fits, an executor of `concurrent.futures` (whose processes
       are not forked) or a Dask client; by default this process. The results are the same to the
@@ -499,6 +545,10 @@ def run_study(
     used = _checked(USUAL | table.options | given)
     usual = {name: used.pop(name) for name in READING if name in used}
     used = used | {"starts": starts, "key": key}
+    for name in ORDERS:
+        there = list(dict.fromkeys(getattr(row, name[:-1]) for row in table.rows))
+        if used[name] is not None and sorted(used[name]) != sorted(there):
+            raise ValueError(f"{name} = {list(used[name])}: give all of {', '.join(there)}, once")
     with told(progress, f"study of {len({row.person for row in table.rows})} people") as tell:
         tell("reading recordings", 0.0)
         most = READ if fit else 1.0

@@ -188,12 +188,8 @@ def judged(ended: Endpoint) -> tuple[Adequacy | None, tuple[str, ...]]:
     )
     if not all(part.statistics.known for part in objective.parts):
         return None, ()
-    generator = generator_of(problem, 5)
     count, rows = len(found.residuals), len(refit.prior)
-    drawn = np.concatenate(
-        [_drawn(objective, scatter, generator), generator.normal(size=(REPLICATES, rows))], axis=1
-    )
-    rest = refit.left(drawn, np.argmin(refit.cost(drawn), axis=1))
+    rest = refitted_residuals(ended, generator_of(problem, 5))
     here, expected, p = _tested(found.residuals, rest[:, :count])
     misfit = ""
     if p < ADEQUATE:
@@ -219,6 +215,16 @@ def judged(ended: Endpoint) -> tuple[Adequacy | None, tuple[str, ...]]:
         for words, (chi2, mean, own) in hidden.items()
     )
     return Adequacy(here, expected, p, misfit), said
+
+
+def refitted_residuals(ended: Endpoint, generator: np.random.Generator) -> Rows:
+    """What a refit leaves of residuals at the truth, those of the prior included, of many data sets
+    of the fitted model."""
+    refit = ended.refit
+    own = _drawn(ended.objective, ended.scatter, generator)
+    prior = generator.normal(size=(REPLICATES, len(refit.prior)))
+    drawn = np.concatenate([own, prior], axis=1)
+    return refit.left(drawn, np.argmin(refit.cost(drawn), axis=1))
 
 
 def _tested(residuals: np.ndarray, rest: np.ndarray) -> tuple[float, float, float]:
@@ -356,7 +362,8 @@ def _worst_run(
     i = int(np.argmax(np.abs(ratio)))
     run = slice(first[i], last[i])
     low, high = frequency[run][[0, -1]]
-    place = f"at {low:.2g} Hz" if low == high else f"from {low:.2g} to {high:.2g} Hz"
+    low, high = f"{low:.2g}", f"{high:.2g}"
+    place = f"at {low} Hz" if low == high else f"from {low} to {high} Hz"
     said = (
         f"{'more' if ratio[i] > 0 else 'less'} power than the model {place} ({abs(ratio[i]):.1f}"
         " standard errors)"

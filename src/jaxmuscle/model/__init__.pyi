@@ -15,6 +15,7 @@ from ._parameters import PARAMETERS as PARAMETERS
 from ._parameters import Parameter as Parameter
 from ._partition import partition as partition
 from ._pink_noise import PinkNoise as PinkNoise
+from ._reflex import Reflex as Reflex
 from ._resonant_noise import ResonantNoise as ResonantNoise
 from ._rungs import on_rung as on_rung
 from ._signals import AbstractSignal as AbstractSignal

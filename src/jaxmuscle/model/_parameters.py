@@ -35,6 +35,10 @@ _TWITCH = (
     "twitch contraction times of human muscles, 50 to 110 ms (Buchthal & Schmalbruch 1970, Acta"
     " Physiol Scand 79:435)"
 )
+_REFLEX = (
+    "short-latency stretch reflex of the human ankle, about 45 ms (Kearney, Stein & Parameswaran"
+    " 1997, IEEE Trans Biomed Eng 44(6):493)"
+)
 _TREMOR = "physiological tremor of hand and wrist, 8 to 12 Hz (Elble & Koller 1990, Tremor)"
 _SLOW = "a slower oscillation of wrist force seen near 3 to 4 Hz"
 
@@ -49,6 +53,7 @@ DEFAULT_FREE = (
     "noise_K_w",
     "noise_K_z",
 )
+REFLEX = ("reflex_gain", "reflex_delay", "reflex_time")
 HARMONIC = ("harmonic_amplitude", "harmonic_frequency")
 RESONANCES = ("resonance", "resonance_2")
 RESONANCE = tuple(
@@ -171,6 +176,36 @@ PARAMETERS: dict[str, Parameter] = {
             fit_upper=0.5,
         ),
         Parameter(
+            "reflex_gain",
+            "g",
+            "N s/m",
+            5.0,
+            "gain of a velocity reflex; 0, the default of a task, is none",
+            "of the size of the passive damping of the default muscle",
+            prior_sd=2.0,
+        ),
+        Parameter(
+            "reflex_delay",
+            "d",
+            "s",
+            0.045,
+            "delay of the reflex",
+            _REFLEX,
+            fit_lower=0.02,
+            fit_upper=0.13,
+        ),
+        Parameter(
+            "reflex_time",
+            "T_r",
+            "s",
+            0.05,
+            "contraction time of the reflex",
+            _TWITCH,
+            prior_sd=0.7,
+            fit_lower=0.005,
+            fit_upper=0.3,
+        ),
+        Parameter(
             "resonance_amplitude",
             "σ_1",
             "1",
@@ -289,6 +324,8 @@ def paths_of(task: Any) -> dict[str, tuple]:
     for field in ("amplitude", "frequency", "phase"):
         paths[f"harmonic_{field}"] = ("harmonic", field)
     fields = {field.name for field in dataclasses.fields(task)}
+    if "reflex" in fields and task.reflex is not None:
+        paths |= {f"reflex_{field}": ("reflex", field) for field in ("gain", "delay", "time")}
     for field in ("P_w", "F_ext", "x_z"):
         if field in fields:
             paths[field] = (

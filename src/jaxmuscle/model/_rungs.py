@@ -3,9 +3,10 @@
 from ._activation import Activation
 from ._parameters import default
 from ._resonant_noise import ResonantNoise
-from ._tasks import AbstractTask
+from ._tasks import AbstractTask, PrescribedLength
 
 SLOW, TWITCH, LINE, RESONANCE = "slow part", "twitch", "regular rhythm", "resonance"
+REFLEX = "stretch reflex"
 # as `model_name` calls what `on_rung` makes
 RUNGS = (
     f"{SLOW} + {LINE}",
@@ -29,6 +30,7 @@ def model_name(task: AbstractTask) -> str:
     count = sum(isinstance(noise, ResonantNoise) for noise in task.noise.components)
     parts = [SLOW, *[TWITCH] * (task.activation is not None)]
     parts += [LINE] * (float(task.harmonic.amplitude) != 0)
+    parts += [REFLEX] * (isinstance(task, PrescribedLength) and task.reflex is not None)
     parts += [RESONANCE, f"two {RESONANCE}s"][count - 1 : count] if count else []
     return " + ".join(parts) if len(parts) > 1 else f"{SLOW} alone"
 

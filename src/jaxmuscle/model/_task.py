@@ -36,6 +36,7 @@ from ._parameters import (
     usually_free,
     value_of,
 )
+from ._reflex import Reflex
 from ._resonant_noise import ResonantNoise
 from ._signals import AbstractSignal, Harmonic
 from ._white_noise import BandLimitedNoise
@@ -51,6 +52,7 @@ PARTS = {
     "noise": (AbstractNoise, "jaxmuscle.PinkNoise(), or a name, as 'pink'"),
     "harmonic": (Harmonic, "jaxmuscle.Harmonic(amplitude=0.02, frequency=9.0)"),
     "activation": (Activation, "jaxmuscle.Activation(time=0.06)"),
+    "reflex": (Reflex, "jaxmuscle.Reflex(gain=5.0, delay=0.045)"),
     "settings": (SpectrumSettings, "jaxmuscle.SpectrumSettings.named('slow')"),
 }
 

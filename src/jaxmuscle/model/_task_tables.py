@@ -19,6 +19,7 @@ from . import (
     _muscle,
     _noise,
     _pink_noise,
+    _reflex,
     _resonant_noise,
     _signals,
     _tasks,
@@ -35,7 +36,7 @@ _BASES = (
     _noise.AbstractNoise,
     _signals.AbstractSignal,
 )
-_PARTS = (*_BASES, _activation.Activation, _signals.Harmonic, AbstractTask)
+_PARTS = (*_BASES, _activation.Activation, _reflex.Reflex, _signals.Harmonic, AbstractTask)
 _KINDS: dict[str, type] = {
     kind.__name__: kind
     for module in (
@@ -43,6 +44,7 @@ _KINDS: dict[str, type] = {
         _muscle,
         _noise,
         _pink_noise,
+        _reflex,
         _resonant_noise,
         _signals,
         _tasks,

@@ -12,7 +12,8 @@ from jaxmuscle._common.types import Scalar
 
 from ._muscle import AbstractMuscle, Perturbation
 from ._parameters import PARAMETERS, default
-from ._signals import AbstractSignal, as_held, as_level, as_signal, derivatives
+from ._reflex import Reflex
+from ._signals import AbstractSignal, Constant, as_held, as_level, as_signal, derivatives
 from ._task import AbstractTask, State, check_smooth, check_smooth_envelope, check_task, fill
 
 Observed = Literal["displacement", "acceleration"]
@@ -172,14 +173,18 @@ class PrescribedLength(AbstractTask):
       over time become one by `jaxmuscle.model.Sampled.through(times, values)`
     - `muscle`, `noise`, `harmonic`, `activation`, `settings`, `initial`: the fields that all tasks
       have
+    - `reflex`: a `Reflex`, which only the linear response has (`dynamic_stiffness`, fits): F_ext
+      answers a lengthening l with `H l + G_P R l`, G_P being what F_ext does with a force on the
+      active tissue. In a hold it does nothing
     - any other name: a parameter of the table `jaxmuscle.model.PARAMETERS`, as `k_w=4e5`
 
-    **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly, and for
-    an x_z that is not smooth.
+    **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly, for an
+    x_z that is not smooth, and for what moves with a reflex: a delay cannot be simulated yet.
     """
 
     P_w: AbstractSignal = eqx.field(converter=as_signal, default=default("P_w"))
     x_z: AbstractSignal = eqx.field(converter=as_held, default=default("x_z"))
+    reflex: Reflex | None = eqx.field(default=None, kw_only=True)
     state_names: ClassVar[tuple[str, ...]] = ("x_w", "v_w")
     state_units: ClassVar[tuple[str, ...]] = ("m", "m/s")
     output_name: ClassVar[str] = "F_ext"
@@ -198,6 +203,14 @@ class PrescribedLength(AbstractTask):
         check_task(self)
         if isinstance(self.x_z, AbstractSignal):
             check_smooth(self, "x_z", 2)
+        if self.reflex is not None:
+            self.reflex.__check_init__()
+            require(
+                not isinstance(self.x_z, AbstractSignal) or type(self.x_z) is Constant,
+                "reflex: the insertion moves, and what a reflex does then can be computed in linear"
+                " response only (jaxmuscle.response.dynamic_stiffness): hold x_z, or leave the"
+                " reflex out",
+            )
 
     def insertion(self, t: Scalar) -> tuple[Scalar, Scalar, Scalar]:
         """Where the insertion is at time t [s], its velocity and its acceleration."""

@@ -67,6 +67,7 @@ def _entries(argument: str, given: Any) -> Iterable[tuple[str, Any]]:
 
 
 METHODS = ("linear", "montecarlo")
+REFLEXES = ("auto", "none", "linear")
 MOST = 10**9  # of starts, seeds and steps: what is more is a slip
 DT = 2.5e-3
 
@@ -109,6 +110,7 @@ class OneFitOptions(SimulationOptions, total=False):
     method: str
     mean_force: tuple[float, float] | Literal[False] | None
     dt: float
+    reflex: str
 
 
 class JointFitOptions(SimulationOptions, total=False):
@@ -144,6 +146,7 @@ class FitOptions:
     max_steps: int = 40
     dt: float = DT
     rungs: int | None = None
+    reflex: str = "auto"
     progress: Tell = nothing
 
     @classmethod
@@ -172,6 +175,8 @@ class FitOptions:
         ):
             if getattr(self, name) is not None:
                 count(name, getattr(self, name), least, MOST)
+        if self.reflex not in REFLEXES:
+            raise ValueError(f"reflex = {self.reflex!r}: {choices(str(self.reflex), REFLEXES)}")
         check_key(self.key)
         positive("dt", self.dt)
         check_data(self.coefficient_of_variation, self.mean_force)

@@ -30,6 +30,7 @@ from ._spectra import target as target
 from ._starts import starts as starts
 from ._steadiness import steadiness as steadiness
 from ._study import study as study
+from ._study import study_trials as study_trials
 from ._style import BLUE as BLUE
 from ._style import GREEN as GREEN
 from ._style import ORANGE as ORANGE

@@ -25,6 +25,7 @@ from ._style import (
     ink,
     log_axis,
     rows_for,
+    shade,
     shade_deviations,
     shorten,
     styled,
@@ -50,15 +51,18 @@ def fit(result: Any, ax: Axes | None = None) -> AnyFigure:
 
     Points and band are those of `target`. The fit is the mean of new simulations, where there are
     some. The parts add up to it: the slow part is from noise on the active tissue, the floor from
-    noise on the passive one. Behind them stands which share of the power each holds, and where it
-    is a rhythm its frequency in the drive (dashed); a resonance holds power in all bins. Residuals
-    are in standard deviations of the log power, positive where the data are above the fit; those
-    beyond two are red. Below stand the first seconds of the recording, where there was one, beside
+    noise on the passive one. Behind them stands which share of the power each holds, unless the
+    model does not describe the data; of a rhythm only if its frequency in the drive is determined,
+    which then is dashed; a resonance holds power in all bins. Residuals are in standard deviations
+    of the log power, positive where the data are above the fit; those beyond two are red and
+    open. Below stand the first seconds of the recording, where there was one, beside
     some that the fitted muscle gave. Letters are legible in a column of 85 mm.
 
     **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`, its place. **Returns:** the figure.
     """
     parts, alone = result.parts, len(result.parts) == 1
+    fixed = (name for name, p in result.parameters.items() if not p.free)
+    known = None if result.adequate is False else {*result.determined, *fixed}
     spectra = {name: part for name, part in parts.items() if part.fitted.size}
     moved = {name: part for name, part in parts.items() if part.stiffness is not None}
     across = 1 if alone else ACROSS
@@ -76,7 +80,7 @@ def fit(result: Any, ax: Axes | None = None) -> AnyFigure:
         row, place = 2 * (number // across), slice(None) if alone else number % across
         upper = fig.add_subplot(grid[row, place])
         lower = fig.add_subplot(grid[row + 1, place], sharex=upper)
-        _spectrum(upper, part, None if alone else name)
+        _spectrum(upper, part, None if alone else name, known)
         _residuals(lower, part)
     row = 2 * rows_for(len(spectra), across)
     for part in traces:
@@ -92,8 +96,9 @@ def fit(result: Any, ax: Axes | None = None) -> AnyFigure:
     return finish(fig, heights, columns=3)
 
 
-def _spectrum(ax: Axes, part: Any, name: str | None) -> None:
-    """The target and the fit; of one among several, its name, and the parts without numbers."""
+def _spectrum(ax: Axes, part: Any, name: str | None, known: set[str] | None) -> None:
+    """The target and the fit; of one among several, its name, and the parts without numbers.
+    `known`, see `_parts_of_power`."""
     fitted = np.asarray(part.fitted)
     target(part.target, ax, log=True)
     without_legend(ax)
@@ -109,7 +114,7 @@ def _spectrum(ax: Axes, part: Any, name: str | None) -> None:
     if np.isfinite(fitted).all():
         dots.set_linewidth(0.0)
         ax.plot(frequency, fitted, color=BLUE, label="fit", zorder=4)
-        low = _parts_of_power(ax, part, low, numbers=name is None)
+        low = _parts_of_power(ax, part, low, known if name is None else None)
     ax.set(xlim=(frequency[0] / 1.15, frequency[-1] * 1.15), ylim=(low / 1.4, seen.max() * 1.4))
     ax.set(xlabel="", ylabel=PER_BIN)
     ax.set_title(shorten(name or "", 24), parse_math=False)
@@ -117,9 +122,12 @@ def _spectrum(ax: Axes, part: Any, name: str | None) -> None:
     log_axis(ax, "y")
 
 
-def _parts_of_power(ax: Axes, part: Any, low: float, *, numbers: bool) -> float:
+def _parts_of_power(ax: Axes, part: Any, low: float, known: set[str] | None) -> float:
     """A line for each part, dashed at the frequency of a rhythm; down to where all can be seen, at
-    most a decade below `low`."""
+    most a decade below `low`.
+
+    With numbers, of a rhythm where its frequency is among the `known`; None: without any.
+    """
     frequency, fitted = np.asarray(part.frequency_hz), np.asarray(part.fitted)
     shares = part.components or {"harmonic": part.harmonic_share}
     resonances = [noise for noise in part.task.noise.components if noise.sort == "resonance"]
@@ -136,14 +144,16 @@ def _parts_of_power(ax: Axes, part: Any, low: float, *, numbers: bool) -> float:
         total = float(np.sum(power))
         if not total > LEAST:
             continue
-        label = f"{words}, {'<1' if total < 0.01 else f'{100 * total:.2g}'} %"
-        if name in rhythms:
+        label = words
+        if known is not None and (name not in rhythms or f"{name}_frequency" in known):
+            label += f", {'<1' if total < 0.01 else f'{100 * total:.2g}'} %"
+        if known is not None and name in rhythms and f"{name}_frequency" in known:
             where = float(rhythms[name].frequency)
             label += f" ({where:.3g} Hz)"
             if frequency[0] / 2 <= where <= frequency[-1] * 1.05:
                 ax.axvline(where, color=color, lw=0.8, ls=(0, (4, 2)), zorder=0)
         style: Style = {"color": color, "ls": dashes, "lw": 1.0, "zorder": 3}
-        ax.plot(frequency, power, label=label if numbers else words, **style)
+        ax.plot(frequency, power, label=label, **style)
         lowest = min(lowest, float(np.max(power)) / 2)
     return max(lowest, low / DECADE)
 
@@ -156,12 +166,13 @@ def _residuals(ax: Axes, part: Any) -> None:
         shade_deviations(ax)
     if not finite.all():
         _say(ax, "no finite fit")
-    for which, color in (
-        (finite & ~((np.abs(residual) > 2) & known), BLUE),
-        (finite & (np.abs(residual) > 2) & known, VERMILLION),
+    for which, color, inside in (
+        (finite & ~((np.abs(residual) > 2) & known), BLUE, BLUE),
+        (finite & (np.abs(residual) > 2) & known, VERMILLION, shade(0.0)),
     ):
         ax.vlines(frequency[which], 0, residual[which], color=color, lw=1.0, zorder=3)
-        ax.plot(frequency[which], residual[which], "o", color=color, ms=2.8, zorder=3)
+        style: Style = {"color": color, "mfc": inside, "ms": 2.8, "zorder": 3}
+        ax.plot(frequency[which], residual[which], "o", **style)
     ax.axhline(0, color=ink(), lw=0.6, zorder=4)
     least = 3.0 if known else 0.1
     reach = 1.1 * float(np.max(np.abs(residual), where=finite, initial=least))

@@ -34,12 +34,14 @@ KINDS = {
     "relative_power": "power",
     "power": "power",
 }
+RELATIVE_UNIT = "1e-6 mean²"  # of power over the squared mean
 # what a number without a unit is a fraction of, and how it is printed
 FRACTIONS = {
-    "relative_power": (1e4, "(% of mean)²"),
+    "relative_power": (1e6, RELATIVE_UNIT),
     "coefficient_of_variation": (1e2, "% of mean"),
     "model_coefficient_of_variation": (1e2, "% of mean"),
     "tremor_size": (1e2, "% of mean"),
+    "tremor_detectable": (1e2, "% of mean"),
     "share": (1e2, "%"),
     "band": (1e2, "%"),
     "level": (1e2, "% of maximum"),

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from ._numbers import RELATIVE_UNIT
 from ._style import (
     GREEN,
     GREY,
@@ -44,8 +45,8 @@ def steadiness(steadiness: Any, ax: Axes | None = None) -> AnyFigure:
 
     Grey are the trials. Black, in the spectrum their mean, elsewhere the value of all trials with
     its 95 % interval. Green is the frequency of the tremor with its interval, a shade the band in
-    which it was looked for. All is in % of the mean; in the unit of the signal, where nothing
-    varies about a mean. Letters are legible in a column of 85 mm.
+    which it was looked for. Power is over the squared mean, variation in % of the mean; both in the
+    unit of the signal, where nothing varies about a mean. Letters are legible in a column of 85 mm.
     """
     measures = steadiness.measures
     varied = {words: n for words, n in VARIATIONS.items() if np.isfinite(measures[n].value)}
@@ -55,17 +56,19 @@ def steadiness(steadiness: Any, ax: Axes | None = None) -> AnyFigure:
     upper = grid[1].subgridspec(1, len(ratios), width_ratios=ratios)
     lower = grid[2].subgridspec(1, len(REGULARITY))
     spectrum, power, *below = (fig.add_subplot(at) for at in (grid[0], *upper, *lower))
-    unit, kind, scale = steadiness.unit, "power_", 1.0
+    density = density_unit(steadiness.unit)
+    unit, kind, scale = density.removesuffix("/Hz"), "power_", 1.0
     if varied:
-        unit, kind, scale = "%", "relative_power_", 100 / abs(measures["mean"].value)
-    _spectrum(spectrum, steadiness, scale**2, unit)
+        unit, kind, scale = RELATIVE_UNIT, "relative_power_", 1e6
+        density = f"{unit}/Hz"
+    _spectrum(spectrum, steadiness, scale / measures["mean"].value ** 2 if varied else 1.0, density)
     bands = [name for name in measures if name.startswith(kind)]
-    _dots(power, steadiness, bands, 1e4 if varied else 1.0)
+    _dots(power, steadiness, bands, scale)
     edges = ["0", *(name.split("_")[-1] for name in bands[:-1]), "30"]  # the low-pass ends the last
     power.set_xticks(np.arange(len(edges)) - 0.5, edges)
     log_axis(power, "y")
     power.set_xlabel("Frequency (Hz)")
-    power.set_ylabel(f"Power ({density_unit(unit).removesuffix('/Hz')})", parse_math=False)
+    power.set_ylabel(f"Power ({unit})", parse_math=False)
     if varied:
         _dots(below[0], steadiness, [*varied.values()], 100.0)
         below[0].set_xticks(range(len(varied)), varied)
@@ -79,7 +82,7 @@ def steadiness(steadiness: Any, ax: Axes | None = None) -> AnyFigure:
     return finish(fig, HEIGHTS)
 
 
-def _spectrum(ax: Axes, steadiness: Any, scale: float, unit: str) -> None:
+def _spectrum(ax: Axes, steadiness: Any, scale: float, density: str) -> None:
     """Of every trial and of all, and where the tremor is, or was looked for."""
     f, each, whole = (np.asarray(x) for x in steadiness.spectrum)
     tremor, band = steadiness.measures["tremor_frequency"], steadiness.band
@@ -98,7 +101,7 @@ def _spectrum(ax: Axes, steadiness: Any, scale: float, unit: str) -> None:
             ax.axvspan(low, high, color=GREEN, alpha=0.25, lw=0, zorder=1)
             label += f" ({low:.2f} to {high:.2f})"
         ax.axvline(tremor.value, color=GREEN, lw=1.2, zorder=1, label=label)
-    frequency_axes(ax, True, f"Power ({density_unit(unit)})")
+    frequency_axes(ax, True, f"Power ({density})")
     ax.set_xlim(f[0] / 1.1, f[-1])
 
 

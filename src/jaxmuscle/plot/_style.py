@@ -169,7 +169,7 @@ def output_label(name: str, unit: str) -> str:
 
 
 def density_unit(unit: str) -> str:
-    return f"{unit}²/Hz" if unit.isalpha() or unit == "%" else f"({unit.replace('^2', '²')})²/Hz"
+    return f"{unit}²/Hz" if unit.isalpha() else f"({unit.replace('^2', '²')})²/Hz"
 
 
 def shorten(name: str, most: int) -> str:

@@ -26,7 +26,7 @@ from jaxmuscle.fits._checks import CONVERGED
 from jaxmuscle.fits._intervals import HALF_POWER
 from jaxmuscle.fits._result import RELATIVE, Estimate, FitResult, FittedPart, once
 from jaxmuscle.model._parameters import PARAMETERS
-from jaxmuscle.model._rungs import model_name
+from jaxmuscle.model._rungs import REFLEX, model_name
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._derived import GAINS, LIMB, MEANINGS, PHASES, TISSUES, VARIATION
 from jaxmuscle.spectra._bin_law import ENOUGH, samples_of_trials
@@ -54,10 +54,13 @@ RHYTHMS = {
     "resonance_2_frequency": "second resonance",
     "harmonic_frequency": "regular rhythm",
     "half_power_frequency": "half-power frequency",
+    "reflex_gain": "reflex, gain",
+    "reflex_delay": "reflex, delay",
+    "reflex_time": "reflex, contraction time",
 }
 OF_LIMB = {
     "tangent_stiffness": "tangent_stiffness, H(0)",
-    "B0": "B0, Im H / 2πf as f -> 0",
+    "B0": "B0, damping as f -> 0",
     "m_z": "m_z, moved mass",
 }
 IN_SERIES_ONLY = "if there are two tissues in series and nothing beside them:"
@@ -78,6 +81,7 @@ KINDS = {
     "corner frequency": ("corner_frequency",),
     "half-power frequency": ("half_power_frequency",),
     "regular rhythm": ("harmonic_",),
+    "stretch reflex": ("reflex_",),
     "second resonance": ("resonance_2_",),
     "resonance": ("resonance_",),
     "": ("model_", *BANDS),  # these are measured
@@ -211,7 +215,10 @@ def _judged(result: FitResult) -> list[str]:
     if not result.success:
         return [f"MODEL  {result.verdict}"]
     parts = [part for part in result.parts.values() if part.fitted.size]
-    name = " and ".join(dict.fromkeys(model_name(part.task) for part in parts)) or IN_SERIES
+    name = " and ".join(dict.fromkeys(model_name(part.task) for part in parts))
+    if not parts:
+        reflex = "reflex_gain" in result.parameters
+        name = IN_SERIES + f" + {REFLEX}" * reflex
     verdict = result.adequacy
     if verdict is None:
         return [f"MODEL  {name}: {result.verdict}"]

@@ -10,17 +10,16 @@ import scipy
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.text import probability
 from jaxmuscle.data._measured import LEVEL, is_recorded, tremor_band
-from jaxmuscle.data._recording import UNRAMPED
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._study_text import (
     counted,
-    found_windows,
     lengths_of_study,
     people_in_words,
     range_of,
+    windows_chosen,
     windows_of,
 )
 
@@ -56,7 +55,7 @@ def study_methods(study: "StudyResult") -> str:
     """People, recordings, spectra, model, fit, statistics and versions, as the methods section of a
     paper says them."""
     target = study.cells[0].target
-    rates = [rate for cell in study.cells for rate in cell.rates]
+    rates = [r.rate for cell in study.cells for r in cell.recordings]
     trials = [cell.trials for cell in study.cells]
     segments = [sum(cell.target.segments or ()) for cell in study.cells]
     whose = "person and condition" if any(study.conditions) else "person"
@@ -87,16 +86,16 @@ def study_methods(study: "StudyResult") -> str:
 
 def _parts(study: "StudyResult", number: int) -> str:
     """How the analysed part of every recording was chosen, how long it is."""
-    found, lengths = found_windows(study), lengths_of_study(study)
-    long = f" These parts were {range_of(lengths)} s long." if lengths else ""
+    chosen = windows_chosen(study)
+    found, long = chosen["found"], f"were {range_of(lengths_of_study(study))} s long."
+    if chosen["all"] == number:
+        return f"Recordings were analysed as a whole. They {long}"
+    long = f" These parts {long}"
     if not found:
         named = study.options["reading"].get("window")
-        notices = [notice for cell in study.cells for notice in cell.target.notices]
-        if isinstance(named, tuple | list):
+        if isinstance(named, tuple | list) and chosen["given"] == number:
             return f"Recordings were analysed from {named[0]:g} s to {named[1]:g} s."
-        if lengths and not any(UNRAMPED in notice for notice in notices):
-            return f"Recordings were analysed in parts that were specified.{long}"
-        return f"Recordings were analysed as a whole.{long.replace('These parts', 'They')}"
+        return f"Recordings were analysed in parts that were specified.{long}"
     some = f"In {found} of {number} recordings the" if found < number else "The"
     others = "; in the others the part was specified, or all was analysed" * (found < number)
     return (
@@ -246,15 +245,21 @@ def _tried(result: "FitResult") -> list[str]:
 def _assumed(result: "FitResult") -> list[str]:
     """Priors of what was free, and the values of what was not."""
     centre, sd = (result.settings.get(name, {}) for name in ("prior_centre", "prior_sd"))
-    units = {name: f" {row.unit}" * (row.unit != "1") for name, row in PARAMETERS.items()}
+
+    def shown(name: str, value: float) -> str:
+        """With its unit, per newton of force where the result is."""
+        unit = PARAMETERS[name].unit if name in PARAMETERS else "1"
+        scale, unit = result.scale_as_shown(unit)
+        return f"{scale * value:.4g}{f' {unit}' * (unit != '1')}"
+
     priors = ", ".join(
-        f"{name} {value:.4g}{units.get(name, '')} ({sd[name]:.2g})"
+        f"{name} {shown(name, value)} ({sd[name]:.2g})"
         for name, value in centre.items()
         if sd.get(name) is not None
     )
     silent = float(result.task.harmonic.amplitude) == 0
     held = [
-        f"{name} = {p.value:.4g}{units.get(name, '')}"
+        f"{name} = {shown(name, p.value)}"
         for name, p in result.parameters.items()
         if not p.free and not (silent and name.startswith("harmonic_"))
     ]

@@ -3,13 +3,16 @@ how it was made."""
 
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxmuscle._common import pages
 from jaxmuscle._common.environment import versions
+from jaxmuscle._common.figures import pixels_of
 from jaxmuscle._common.pages import Html
+from jaxmuscle.data._measure import Measure
+from jaxmuscle.plot._numbers import in_print
 
 from ._cohort_text import judged_in_words
 from ._ladder_text import format_p
@@ -23,9 +26,11 @@ from ._study_text import (
     is_clear,
     missing_in_words,
     n_in_words,
+    only_some_described,
     p_in_words,
     people_in_words,
     people_of_columns,
+    study_notices,
     table_1,
     trials_in_words,
 )
@@ -66,12 +71,16 @@ FIGURES = {
         " every target (thin), the geometric mean of each group with its standard error (thick)."
     ),
     "quantities": (
-        "What is compared. Dots: people, with standard errors (of the scatter of their trials, or"
-        " within them). Grey: the mean of the group."
+        "What is compared. Small dots: people, joined from condition to condition. Beside them:"
+        " their mean with its 95 % interval. Above: p of the difference within people, corrected."
     ),
     "spectra": (
-        "Spectra of all people (thin), and the geometric mean of each group with its standard error"
-        " (thick)."
+        "Spectra of all people (thin), and their geometric mean with its standard error (thick)."
+        " Triangles: tremors of people."
+    ),
+    "trials": (
+        "All recordings. Shaded: what is analysed. Those of a person have one scale; the times and"
+        " columns are in the table below."
     ),
     "corner": (
         "What the data determine. Diagonal: density, median and 95 % interval. Below it: regions of"
@@ -102,13 +111,13 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
     card = result.summary()
     rows = {
         state: [row[:STATE] + row[STATE + 1 :] for row in card.rows if row[STATE] == state]
-        for state in ("measured", "determined", "not determined", "fixed")
+        for state in ("determined", "not determined", "fixed")
     }
     held = result.adequate is not False
     body = [
         _verdict(card.heading, good=False if not result.success else result.adequate),
         pages.picture(figure, FIGURES["fit" if _has_spectrum(result) else "stiffness"]),
-        *_measured([row[:STATE] for row in rows["measured"]]),
+        *_measured(result.measured),
         *_table(
             "What the data determine" if held else WOULD,
             PARAMETERS,
@@ -140,11 +149,15 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
     pages.write_page(folder / REPORT, result.title, body)
 
 
-def _measured(rows: list[tuple[str, ...]]) -> list[Html]:
-    """What papers state; what else is measured, folded."""
-    columns = PARAMETERS[:STATE]
-    stated = [row for row in rows if row[0] in WORDS]
-    others = [row for row in rows if row[0] not in WORDS]
+def _measured(measures: Mapping[str, Measure]) -> list[Html]:
+    """What papers state; what else is measured, folded. In words, shares in percent."""
+    columns = ("", *PARAMETERS[1 : STATE - 1])
+    rows: dict[bool, list[tuple[str, ...]]] = {True: [], False: []}
+    for name, m in measures.items():
+        scale, words = in_print(name, m.unit)
+        scaled = m.times(scale)
+        rows[name in WORDS].append((words, scaled.in_words(), scaled.interval_in_words()))
+    stated, others = rows[True], rows[False]
     body = _table("What is measured", columns, stated or others)
     if stated and others:
         body.append(pages.folded(f"{len(others)} more numbers", pages.table(columns, others)))
@@ -247,7 +260,9 @@ def study_report(study: "StudyResult", folder: Path) -> None:
     import matplotlib.pyplot as plt
 
     figures = study.figures()
-    pictures = [pages.picture(figure, FIGURES[name]) for name, figure in figures.items()]
+    # thousands of points: as SVG they are many times as large
+    drawn = {"trials": pixels_of(figures["trials"])}
+    picture = dict(zip(figures, _pictures(figures, drawn), strict=True))
     for figure in figures.values():
         plt.close(figure)
     heads, lines = table_1(study)
@@ -257,7 +272,7 @@ def study_report(study: "StudyResult", folder: Path) -> None:
     body = [
         pages.items((people_in_words(study), trials_in_words(study))),
         *([_judged(study.cohort)] if study.aic else []),
-        *pictures,
+        *(shown for name, shown in picture.items() if name != "trials"),
         *_table(
             "Table 1: mean ± SD of people",
             ("", *heads),
@@ -273,12 +288,40 @@ def study_report(study: "StudyResult", folder: Path) -> None:
             "What to do next",
             (
                 "Report p corrected, n and how many people were left out of each comparison.",
-                "All numbers are in table1.csv, people.csv and differences.csv.",
+                *([only_some] if (only_some := only_some_described(study)) else []),
+                "All numbers are in table1.csv, people.csv, differences.csv and trials.csv.",
             ),
         ),
+        *_recordings(study, picture["trials"]),
         *_how(options | {"source": study.source}, versions()),
     ]
     pages.write_page(folder / REPORT, "Study", body)
+
+
+def _recordings(study: "StudyResult", picture: Html) -> list[Html]:
+    """What was analysed, what is to be noticed of it."""
+    rows = [
+        (
+            r["person"],
+            ", ".join(filter(None, (r["group"], r["condition"]))),
+            r["trial"],
+            r["file"],
+            r["column"],
+            f"{r['rate_hz']:g}",
+            f"{r['start_s']:.2f}",
+            f"{r['stop_s']:.2f}",
+            r["chosen"],
+        )
+        for r in study.trials()
+    ]
+    columns = ("person", "", "trial", "file", "column", "rate, Hz", "start, s", "stop, s", "part")
+    notices = study_notices(study)
+    return [
+        pages.heading("What was analysed"),
+        *([pages.items(notices)] if notices else []),
+        picture,
+        pages.folded(f"{len(rows)} recordings", pages.table(columns, rows)),
+    ]
 
 
 def _differences(study: "StudyResult") -> list[Html]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import WIDTH, folded
 from jaxmuscle.data._measured import MEASURES
-from jaxmuscle.data._recording import FOUND
+from jaxmuscle.data._recording import FOUND, SEVERAL
 from jaxmuscle.fits._differences import Difference
 from jaxmuscle.model._rungs import RUNGS
 
@@ -22,14 +22,15 @@ if TYPE_CHECKING:
 # comparisons on a terminal: a study of two groups and two conditions has 24 lines
 MOST, MOST_OF_MODEL = 5, 2
 TREMOR = "tremor_frequency"
+POWER, SHORT = "1e-6 mean²", "1e-6"
 # quantities in words, their unit (None: their own), what the numbers are multiplied with
 WORDS = {
     "mean": ("mean", None, 1.0),
     "standard_deviation": ("standard deviation", None, 1.0),
     "coefficient_of_variation": ("CV", "%", 100.0),
     "coefficient_of_variation_without_drift": ("CV without drift", "%", 100.0),
-    "relative_power_4_8": ("power 4-8 Hz", "ppm", 1e6),
-    "relative_power_8_12": ("power 8-12 Hz", "ppm", 1e6),
+    "relative_power_4_8": ("power 4-8 Hz", POWER, 1e6),
+    "relative_power_8_12": ("power 8-12 Hz", POWER, 1e6),
     "median_frequency": ("median frequency", "Hz", 1.0),
     "sample_entropy": ("sample entropy", "", 1.0),
     "tremor_frequency": ("tremor frequency", "Hz", 1.0),
@@ -37,7 +38,7 @@ WORDS = {
     "resonance_frequency": ("resonance", None, 1.0),
     "resonance_2_frequency": ("slower resonance", None, 1.0),
 }
-GLOSS = "CV: coefficient of variation. ppm: millionths of the squared mean"
+GLOSS = "CV: coefficient of variation"
 REPORT_ONLY = (
     "standard_deviation",
     "coefficient_of_variation_without_drift",
@@ -71,6 +72,7 @@ def _lines(study: "StudyResult") -> list[str]:
         lines += [
             f"MODEL  {RUNGS[study.rung]} (rung {study.rung}){_aic(study)}",
             f"  {study.cohort.verdict}{_clear_of_model(of_model, study)}",
+            *([f"  {only_some}"] if (only_some := only_some_described(study)) else []),
             *(f"  not fitted: {name}: {why}" for name, why in study.cohort.failed.items()),
             *_comparisons(of_model[:MOST_OF_MODEL], study),
         ]
@@ -81,14 +83,15 @@ def _lines(study: "StudyResult") -> list[str]:
 def _measured(study: "StudyResult") -> list[str]:
     """Table 1 as far as a terminal shows it, as many columns beside each other as have room."""
     columns, rows = table_1(study, leave_out=REPORT_ONLY)
-    rows = [("", columns), *((f"  {n}", [c.replace(" ± ", "±") for c in row]) for n, row in rows)]
+    rows = [(f"  {name.replace(POWER, SHORT)}", cells) for name, cells in rows]
+    rows = [("", columns), *((n, [c.replace(" ± ", "±") for c in row]) for n, row in rows)]
     label = max(len(name) for name, _ in rows)
     room = WIDTH - label
     longest = max(len(cell) for _, cells in rows for cell in cells)
     apart = 2 if len(columns) * (longest + 2) <= room else 1
     wide = min(longest + apart, room)
     across = room // wide
-    lines = ["MEASURED  mean ± SD of people. ppm: millionths of the squared mean"]
+    lines = ["MEASURED  mean ± SD of people. 1e-6: millionths of the squared mean"]
     for start in range(0, len(columns), across):
         for name, cells in rows:
             shown = cells[start : start + across]
@@ -115,7 +118,7 @@ def _comparisons(found: list[Difference], study: "StudyResult", head: str = "") 
         if d.kind == "interaction" and len(study.conditions) == 2:
             where = "change"  # there is no other
         name = f"  {quantity}{f', {where}' * bool(where)}: {what}"
-        size = "{} ({})".format(*difference_in_words(d))
+        size = "{} ({})".format(*difference_in_words(d)).replace(POWER, SHORT)
         of = f" of {sum(_people(d)) + d.left_out}" * bool(d.left_out)
         rows.append((name, size, p_in_words(d.p_corrected), n_in_words(d) + of))
     if not rows:
@@ -144,6 +147,14 @@ def clear_in_words(found: list[Difference], study: "StudyResult") -> str:
     alpha, correction = study.options["alpha"], study.options["correction"]
     clear = sum(is_clear(d, alpha) for d in found)
     return f"{clear} of {len(found)} have p < {alpha:g} ({CORRECTED[correction]})"
+
+
+def only_some_described(study: "StudyResult") -> str:
+    """What to do where the model misses some of the data; empty if it does not."""
+    if all(result.adequate is not False for result in study.cohort.results.values()):
+        return ""
+    other = "" if study.options["rung"] == "auto" else " Another model: `--rung auto`."
+    return f"Table 1 and the measured differences need no model: they stay.{other}"
 
 
 def _clear_of_model(found: list[Difference], study: "StudyResult") -> str:
@@ -211,7 +222,8 @@ def difference_in_words(d: Difference) -> tuple[str, str]:
         middle, low, high = (f"{x:.{places}f}" for x in sizes)
     else:
         middle, low, high = (f"{x:.3g}" for x in sizes)
-    return f"{middle} {unit}".rstrip(), f"{low} to {high}"
+    times = "× " * (unit == POWER)
+    return f"{middle} {times}{unit}".rstrip(), f"{low} to {high}"
 
 
 def p_in_words(p: float | None) -> str:
@@ -260,8 +272,8 @@ def trials_in_words(study: "StudyResult") -> str:
     per = "condition" if any(study.conditions) else "person"
     of = f" of {target.quantity} ({target.unit})" if target.unit else ""
     said = f"{counted(sum(each), 'recording')}{of}, {range_of(each)} per {per}"
-    what = "steady parts" if found_windows(study) else "parts"
-    return said + (f", {what} of {range_of(lengths)} s" if lengths else "")
+    what = "steady parts" if windows_chosen(study)["found"] else "parts"
+    return f"{said}, {what} of {range_of(lengths)} s"
 
 
 def windows_of(target: "Target") -> list[tuple[float, float, float]]:
@@ -270,14 +282,13 @@ def windows_of(target: "Target") -> list[tuple[float, float, float]]:
 
 
 def lengths_of_study(study: "StudyResult") -> list[float]:
-    """How long [s] the parts are that are analysed, of all recordings that have a window."""
-    return [round(b - a, 1) for cell in study.cells for _, a, b in windows_of(cell.target)]
+    """How long [s] the parts are that are analysed."""
+    return [round(r.stop - r.start, 1) for cell in study.cells for r in cell.recordings]
 
 
-def found_windows(study: "StudyResult") -> int:
-    """In how many recordings the steady part was found automatically."""
-    notices = [notice for cell in study.cells for notice in cell.target.notices]
-    return sum(notice.count(" s to ") for notice in notices if notice.startswith(FOUND))
+def windows_chosen(study: "StudyResult") -> Counter[str]:
+    """How many of the parts that are analysed were "found", "given" or "all"."""
+    return Counter(r.chosen for cell in study.cells for r in cell.recordings)
 
 
 def study_notices(study: "StudyResult") -> list[str]:
@@ -289,10 +300,26 @@ def study_notices(study: "StudyResult") -> list[str]:
             if not notice.startswith(FOUND):
                 whose.setdefault(notice, []).append(cell.target.name)
     every = len(study.cells)
-    return [
-        f"{'all' if len(names) == every else '; '.join(names)}: {notice}"
+    return _alike(study) + [
+        f"{'all' if len(names) == every else '; '.join(names)}: {notice.removesuffix(SEVERAL)}"
         for notice, names in whose.items()
     ]
+
+
+def _alike(study: "StudyResult") -> list[str]:
+    """Names that differ only as somebody mistypes them."""
+    said = []
+    for what in ("person", "group", "condition"):
+        spelled: dict[str, list[str]] = {}
+        for name in dict.fromkeys(getattr(cell, what) for cell in study.cells):
+            spelled.setdefault("".join(name.casefold().split()), []).append(f'"{name}"')
+        said += [
+            f"{what} {' and '.join(names)} are taken for different ones. If they are the same,"
+            " write them alike in the table"
+            for names in spelled.values()
+            if len(names) > 1
+        ]
+    return said
 
 
 def _aic(study: "StudyResult") -> str:

@@ -49,7 +49,14 @@ def stiffness_at(
     none, s = jnp.zeros_like(d[0]), _laplace(f, system)
     by_place = SignalSystem(system.A, b[:, 0], system.C, d[0], d[1])
     by_velocity = SignalSystem(system.A, b[:, 1], system.C, none, d[2])
-    return -(_gain(by_place, s) + s * _gain(by_velocity, s))
+    found = -(_gain(by_place, s) + s * _gain(by_velocity, s))
+    if task.reflex is None:
+        return found
+    # a force on the active tissue: the state is (x_w, x_w')
+    pull = jnp.stack([none, 1 / jnp.asarray(task.muscle.m_w, none.dtype)])
+    return found + _gain(
+        SignalSystem(system.A, pull, system.C, none, none), s
+    ) * task.reflex.transfer(s)
 
 
 def parts_of_stiffness(

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._muscle import Muscle
-from jaxmuscle.model._parameters import USUALLY_FREE, part_at, paths_of, set_parameters
+from jaxmuscle.model._parameters import REFLEX, USUALLY_FREE, part_at, paths_of, set_parameters
 from jaxmuscle.model._signals import AbstractSignal, Constant, SmoothStep
 from jaxmuscle.model._tasks import AbstractTask
 
@@ -23,7 +23,7 @@ from ._linear_task import Linearisation, LinearTask, balanced, linearise_traced
 POINTS, LATEST = 32, 8  # points of a program; tasks that are kept prepared
 
 # free with a known mean force, with a moved insertion and in designs
-SOMETIMES = ("P_w", "m_w", "m_z")
+SOMETIMES = ("P_w", "m_w", "m_z", *REFLEX)
 
 NOT_MECHANICAL = ("noise", "harmonic", "activation")
 

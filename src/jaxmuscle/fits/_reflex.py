@@ -1,0 +1,159 @@
+"""Is there a stretch reflex in the response of a moved limb? What a fit without one leaves is
+compared with what a reflex of any delay would leave; and a fit with one. `_search.py` calls it when
+a muscle without reflex has been fitted.
+
+The mathematics stand in docs/reflex.md.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle._common.text import probability
+from jaxmuscle.data._target import Target
+from jaxmuscle.model._parameters import REFLEX
+from jaxmuscle.model._reflex import Reflex
+from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
+from jaxmuscle.objective._arguments import Plan, planned
+from jaxmuscle.objective._options import FitOptions
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._starts import OTHER_MODEL, SPREAD, starting_points
+from jaxmuscle.response._input_response import dynamic_stiffness
+
+from ._verdict import REPLICATES, Endpoint, generator_of, refitted_residuals
+
+SEEN = 0.01  # level of the test
+DELAYS = np.arange(0.02, 0.1301, 0.005)  # s
+TIME = 0.05  # s, the contraction time with which it begins
+USUAL = 0.045  # s: a reflex that is left out is taken to have this delay
+POWER = 1.2816  # standard errors: nine of ten are seen
+STATED = ("tangent_stiffness", "K_w_tangent", "K_z0")
+WIDER = "What would tell: a motion that has power up to 20 or 30 Hz, or a larger or longer one"
+
+
+class ReflexTest(NamedTuple):
+    """`p`, how often data without a reflex look as much like one; the `gain` [N s/m] that fits best
+    at each of `DELAYS`, and the `score` there, in standard errors; `least`, the gain of which nine
+    of ten are seen; `shifts` {quantity: by how many of its errors it is off if that is left out}.
+    """
+
+    p: float
+    gain: Float[np.ndarray, " delays"]
+    score: Float[np.ndarray, " delays"]
+    least: float
+    shifts: dict[str, tuple[float, float]]
+
+    @property
+    def seen(self) -> bool:
+        """Whether there is a reflex."""
+        return self.p < SEEN
+
+    @property
+    def notice(self) -> str:
+        """What has to be said of a fit without a reflex."""
+        none = f"no stretch reflex is seen ({probability(self.p)})"
+        off = {name: each for name, each in self.shifts.items() if each[1] > 1}
+        if not off:
+            return f"{none}. One of {self.least:.2g} N s/m would have been seen"
+        words = ", ".join(f"{name} by {100 * share:.0f} %" for name, (share, _) in off.items())
+        return (
+            f"muscle and stretch reflex cannot be told apart in these data. {none[0].upper()}"
+            f"{none[1:]}; but one that is just too weak to be seen ({self.least:.2g} N s/m) would"
+            f" change {words}, more than the stated errors. {WIDER}"
+        )
+
+
+def look_for_reflex(ended: Endpoint) -> ReflexTest | None:
+    """A score test for a linear velocity reflex beside the fitted muscle; None without a response.
+
+    A reflex of gain g, delay d and time T changes the residuals of the dynamic stiffness by g u, u
+    = G_P R / sd. A refit leaves (1 - H) u of that, to first order. With c = (1 - H) u and the
+    fitted residuals r the score is -c·r over its standard deviation in replicates of data without a
+    reflex, each refitted; p is that of the largest score among `DELAYS`.
+    """
+    problem, objective, found = ended.problem, ended.objective, ended.found
+    which = [i for i, part in enumerate(problem.parts) if part.points is not None]
+    if not which or ended.adequacy is None:
+        return None
+    i = which[0]
+    columns = np.zeros((len(DELAYS), len(found.residuals) + len(ended.refit.prior)))
+    shapes = _responses(ended, i) / np.asarray(objective.parts[i].data.stiffness[1])
+    stop, points = objective.rows[i].stop, shapes.shape[1]
+    columns[:, stop - 2 * points : stop] = np.hstack([shapes.real, shapes.imag])
+    left = ended.refit.left(columns)
+    size = np.sum(left**2, axis=1)
+    null = refitted_residuals(ended, generator_of(problem, 8)) @ left.T
+    spread = null.std(axis=0)
+    here = -(np.concatenate([found.residuals, ended.refit.prior]) @ left.T)
+    score, top = here / spread, np.max(null / spread, axis=1)
+    p = (1 + np.sum(top >= score.max())) / (1 + REPLICATES)
+    usual = int(np.argmin(np.abs(DELAYS - USUAL)))
+    least = (np.quantile(top, 1 - SEEN) + POWER) * spread[usual] / size[usual]
+    return ReflexTest(
+        float(p), here / size, score, float(least), _shifts(ended, i, least * columns[usual])
+    )
+
+
+def _responses(ended: Endpoint, i: int) -> np.ndarray:
+    """What a reflex of each delay with a gain of 1 N s/m adds to the dynamic stiffness."""
+    part = ended.problem.parts[i]
+    task = ended.problem.tasks_at(ended.seen.theta)[i]
+    assert isinstance(task, PrescribedLength) and part.points is not None
+    s = 2j * np.pi * part.points
+    at_once = task.with_parts(reflex=Reflex(1.0, 0.0, TIME))
+    added = np.asarray(dynamic_stiffness(at_once, part.points)) - np.asarray(
+        dynamic_stiffness(task, part.points)
+    )
+    return added * np.exp(-np.outer(DELAYS, s))
+
+
+def _shifts(ended: Endpoint, i: int, column: np.ndarray) -> dict[str, tuple[float, float]]:
+    """How far stated quantities are off if a reflex that changes residuals by this column is left
+    out: over their value, and over their standard error."""
+    jacobian, problem = ended.found.jacobian, ended.problem
+    curvature = jacobian.T @ jacobian + problem.precision
+    moved = np.linalg.lstsq(curvature, jacobian.T @ column[: len(jacobian)])[0]
+    found = {}
+    for name in STATED:
+        if name in ended.found.slopes[i]:
+            slope = np.asarray(ended.found.slopes[i][name])
+            value, error = (
+                float(ended.found.values[i][name]),
+                np.sqrt(slope @ ended.covariance @ slope),
+            )
+            off = abs(float(slope @ moved))
+            found[name] = (off / abs(value), off / float(error))
+    return found
+
+
+def planned_with_reflex(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
+    """The fit of a task with a reflex: its gain may be anything above 0, and its delay anything
+    between 20 and 130 ms."""
+    priors = {"reflex_gain": None, "reflex_delay": None, **(options.priors or {})}
+    free = (*options.also_free, *REFLEX)
+    options = dataclasses.replace(options, also_free=free, priors=priors)
+    return planned(task.with_parts(reflex=Reflex()), target, options)
+
+
+def starts_with_reflex(
+    problem: FitProblem, known: dict[str, float], test: ReflexTest
+) -> tuple[Float[np.ndarray, "starts free"], tuple[str, ...]]:
+    """Starts of a fit with a reflex, at every second delay, and how they began: with the muscle as
+    it was found and the gain that fits best beside it; and with the muscles of a fit that begins
+    anew, since without the reflex another one may have taken its place."""
+    c, best = problem.coordinates, float(np.max(test.gain))
+    tried = list(zip(DELAYS[::2], test.gain[::2], strict=True))
+    fresh = c.values_of(np.array(c.theta(starting_points(problem, 2 * len(tried)))))
+    rows = [dict(zip(c.names, row, strict=True)) for row in fresh]
+    for i, row in enumerate(rows):
+        delay, _ = tried[i % len(tried)]
+        row |= dict(zip(REFLEX, (best * (1 + 3 * (i % 2)), delay, TIME), strict=True))
+    rows += [
+        known | dict(zip(REFLEX, (max(gain, 0.1 * best), delay, TIME), strict=True))
+        for delay, gain in tried
+    ]
+    values = np.array([[row[name] for name in c.names] for row in rows])
+    kinds = (SPREAD,) * len(fresh) + (OTHER_MODEL,) * len(tried)
+    return np.asarray(c.from_theta(c.at(values))), kinds
