@@ -351,13 +351,19 @@ def people(count: int) -> None:
             _held(fits, truth(muscle))
 
 
+def _holds(interval: tuple[float | None, float | None], true: float) -> bool:
+    """Whether it holds the truth; an end that is None is open."""
+    low, high = interval
+    return (low or 0.0) < true < (np.inf if high is None else high)
+
+
 def _held(fits: list[jm.fits.FitResult], true: dict[str, float]) -> None:
     """How many of the 95 % intervals hold the truth."""
     print("  95 % intervals that hold the truth:", end="")
     for name, value in true.items():
         known = [fit[name].interval for fit in fits if fit[name].interval is not None]
         print(
-            f" {name} {sum(low < value < high for low, high in known)} of {len(known)} known;",
+            f" {name} {sum(_holds(each, value) for each in known)} of {len(known)} known;",
             end="",
         )
     print(flush=True)
@@ -557,14 +563,14 @@ def _stated(fits: list[jm.fits.FitResult], task: jm.PrescribedLength) -> None:
     for name, found in rows.items():
         stated = [(p.value - t, p.stderr) for t, p in found if p.stderr is not None]
         off, error = np.mean(stated, axis=0) if stated else (np.nan, np.nan)
-        ends = [(t, *p.interval) for t, p in found if p.interval is not None]
-        held = [(low or 0) < t < (high or np.inf) for t, low, high in ends]
+        ends = [(t, p.interval) for t, p in found if p.interval is not None]
+        held = [_holds(each, t) for t, each in ends]
         every = [100 * (p.value / t - 1) for t, p in found]
         print(
             f"  {name:18s} true {found[0][0]:8.4g}  mean {np.mean(every):+5.1f} %, median"
             f" {np.median(every):+5.1f} %; error stated {len(stated)} times,"
             f" {100 * error / found[0][0]:.1f} %, bias over it {off / error:+.2f}; interval"
-            f" {len(ends)} times, one-sided {sum(None in each for each in ends)}, holds"
+            f" {len(ends)} times, one-sided {sum(None in each for _, each in ends)}, holds"
             f" {100 * np.mean(held):.0f} %",
             flush=True,
         )

@@ -129,7 +129,7 @@ def test_what_holds_whatever_the_tissues_are_is_printed_first(fitted):
     assert len(lines) <= 24
     below = next(i for i, line in enumerate(lines) if "two tissues in series" in line)
     above, split = "\n".join(lines[:below]), lines[below + 1 : below + 5]
-    for said in ("tangent_stiffness, H(0)", "B0, Im H", "m_z, moved mass"):
+    for said in ("tangent_stiffness, H(0)", "B0, damping", "m_z, moved mass"):
         assert said in above
     assert sum("deg" in line for line in lines[:below]) == 3
     # their errors would not describe these intervals

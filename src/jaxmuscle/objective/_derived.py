@@ -88,7 +88,7 @@ MEANINGS = {
     "C_z0": "passive damping when nothing moves",
     "K_w_tangent": "active stiffness as displaced in the hold",
     "tangent_stiffness": "stiffness of the limb when pulled slowly, H(0)",
-    "B0": "damping of the limb when pulled slowly, Im H / 2πf for f -> 0",
+    "B0": "damping of the limb when pulled slowly, Im H / 2πf for f -> 0, without a reflex",
     **{
         f"{what}_{third}": f"{what} of the dynamic stiffness in the {words} third of the band"
         for what in ("gain", "phase")

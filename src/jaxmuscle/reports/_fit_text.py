@@ -61,7 +61,7 @@ RHYTHMS = {
 }
 OF_LIMB = {
     "tangent_stiffness": "tangent_stiffness, H(0)",
-    "B0": "B0, Im H / 2πf as f -> 0",
+    "B0": "B0, damping as f -> 0",
     "m_z": "m_z, moved mass",
 }
 IN_SERIES_ONLY = "if there are two tissues in series and nothing beside them:"
