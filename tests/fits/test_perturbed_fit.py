@@ -487,8 +487,8 @@ def test_two_minutes_know_more(minute, result):
         assert 0.5 < both[name].stderr / one[name].stderr < 0.95  # 1 / √2 is expected
         assert one[name].stderr < 1.1 * result[name].stderr, name
     assert one["K_z0"].stderr < 0.9 * result["K_z0"].stderr
-    assert both["m_w"].value == TRUE["m_w"]
-    assert "held fixed: m_w = 0.5 kg. The data do not determine it" in both.details()
+    words = " ".join(both.details().split())
+    assert both["m_w"].value == TRUE["m_w"] and "held fixed: m_w = 0.5 kg. The data do not" in words
 
 
 @pytest.mark.slow
@@ -671,7 +671,8 @@ def test_what_cannot_be_simulated_has_a_response_all_the_same(minute, monkeypatc
     with without_intervals():
         found = jm.fit(jm.PrescribedLength(), minute, **quick)
     assert found.success and found.adequate
-    assert "cannot be simulated (this task has an eigenvalue of 1e+09/s)" in found.notices[0]
+    said = "cannot be simulated (this task has an eigenvalue of 1e+09/s)"
+    assert any(said in notice for notice in found.notices)
     assert abs(found["K_z0"].value - WHOLE["K_z0"]) < 4 * found["K_z0"].stderr
     assert np.all(np.isfinite(found.stiffness))
 

@@ -308,7 +308,7 @@ def _about_axis(result: FitResult, wide: int = WIDTH) -> list[str]:
     units = dict(zip(UNITS["N/m"], UNITS["N m/rad"], strict=True))
     lines = [f"  About the axis of the joint (those in N and m are at {arm:g} m from it):"]
     for name, p in result.as_shown(result.determined).items():
-        if base_of(name) in {*LIMB, *TISSUES} and p.unit in units:
+        if base_of(name) in {*LIMB, *TISSUES, "reflex_gain"} and p.unit in units:
             one = p.times(arm**2, units[p.unit])
             number = f"{one.in_words()} {one.unit}"
             lines.append(f"  {name:<{wide}}{number:<25} {one.interval_in_words()}".rstrip())
