@@ -298,7 +298,7 @@ def _briefly(p: Estimate) -> str:
     return said + f" {p.unit}" * (p.unit not in ("1", ""))
 
 
-def _about_axis(result: FitResult, wide: int = WIDTH) -> list[str]:
+def _about_axis(result: FitResult, wide: int = WIDE) -> list[str]:
     """The numbers of a joint: those of stiffness, damping and mass times the square of the lever
     arm."""
     responses = (part.target.stiffness for part in result.parts.values())
@@ -308,7 +308,8 @@ def _about_axis(result: FitResult, wide: int = WIDTH) -> list[str]:
     units = dict(zip(UNITS["N/m"], UNITS["N m/rad"], strict=True))
     lines = [f"  About the axis of the joint (those in N and m are at {arm:g} m from it):"]
     for name, p in result.as_shown(result.determined).items():
-        if base_of(name) in {*LIMB, *TISSUES, "reflex_gain"} and p.unit in units:
+        own = {*LIMB, *TISSUES, "reflex_gain"} - set(GAINS)
+        if base_of(name) in own and p.unit in units:
             one = p.times(arm**2, units[p.unit])
             number = f"{one.in_words()} {one.unit}"
             lines.append(f"  {name:<{wide}}{number:<25} {one.interval_in_words()}".rstrip())
