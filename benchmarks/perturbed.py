@@ -4,7 +4,7 @@ docs/perturbed.md.
     python benchmarks/perturbed.py PART [--count N]
 
 PART: classical, amplitude, reflex, inertia, active, reference, people, rhythm, richer, linear,
-seconds, coverage or time.
+seconds, limb, coverage or time.
 
 Takes a minute to a quarter of an hour each.
 """
@@ -18,11 +18,13 @@ import jax
 import numpy as np
 import scipy.integrate
 import scipy.interpolate
+import scipy.optimize
 from measure import seconds as timed
 from perturbed_muscle import DT, Sines, force, recorded
 
 import jaxmuscle as jm
 from jaxmuscle.fits import _search
+from jaxmuscle.objective._derived import GAINS, LIMB, PHASES, TISSUES
 
 TASK = jm.PrescribedLength()
 # The bundled knee extension as fitted, with masses of 0.5 kg
@@ -35,6 +37,13 @@ TREMOR = {
     "resonance_frequency": 9.6,
     "resonance_width": 1.6,
 }
+# At 36 N, and not where a fit begins
+STRONG = TASK.replace(
+    **{"m_w": 0.3, "m_z": 1.0, "k_w": 1500 / 4e-4, "k_z": 3000 / 4e-4, "c_w": 150.0, "c_z": 20.0},
+    P_w=60.0,
+    noise_K_w=0.15,
+    noise_K_z=0.003,
+)
 QUICK = {"rungs": 0, "seeds": 0, "check_seeds": 0, "starts": 16}
 
 
@@ -342,13 +351,19 @@ def people(count: int) -> None:
             _held(fits, truth(muscle))
 
 
+def _holds(interval: tuple[float | None, float | None], true: float) -> bool:
+    """Whether it holds the truth; an end that is None is open."""
+    low, high = interval
+    return (low or 0.0) < true < (np.inf if high is None else high)
+
+
 def _held(fits: list[jm.fits.FitResult], true: dict[str, float]) -> None:
     """How many of the 95 % intervals hold the truth."""
     print("  95 % intervals that hold the truth:", end="")
     for name, value in true.items():
         known = [fit[name].interval for fit in fits if fit[name].interval is not None]
         print(
-            f" {name} {sum(low < value < high for low, high in known)} of {len(known)} known;",
+            f" {name} {sum(_holds(each, value) for each in known)} of {len(known)} known;",
             end="",
         )
     print(flush=True)
@@ -495,6 +510,74 @@ def seconds(count: int) -> None:
         )
 
 
+def series(task: jm.PrescribedLength) -> dict[str, float]:
+    """What is stated of a moved limb, by the equations of two tissues in series."""
+    m_w, m_z, P_w = (float(task[name]) for name in ("m_w", "m_z", "P_w"))
+    own = truth(task)
+    K_w, K_z, C_w, C_z = own.values()
+
+    def force(x: float) -> float:
+        return (K_w * (1 + (x / float(task["x_ref_w"])) ** 2) + K_z) * x - P_w
+
+    x = scipy.optimize.brentq(force, 0.0, 0.5)
+    T = K_w * (1 + 3 * (x / float(task["x_ref_w"])) ** 2)
+    return own | {
+        "K_w_tangent": T,
+        "tangent_stiffness": T * K_z / (T + K_z),
+        "B0": (C_z * T**2 + C_w * K_z**2) / (T + K_z) ** 2,
+        "m_z": m_z,
+        "m_w": m_w,
+    }
+
+
+def answer(task: jm.PrescribedLength, f: float) -> complex:
+    """The dynamic stiffness of two tissues in series [N/m] at a frequency [Hz]."""
+    at, s = series(task), 2j * np.pi * f
+    active = at["m_w"] * s**2 + at["C_w0"] * s + at["K_w_tangent"]
+    passive = at["C_z0"] * s + at["K_z0"]
+    return active * passive / (active + passive) + at["m_z"] * s**2
+
+
+def limb(count: int) -> None:
+    """What is stated of a moved limb: bias over the stated error, and intervals that hold."""
+    for words, task in (("default muscle, 2.2 N", TASK), ("strong muscle, 36 N", STRONG)):
+        print(words)
+        _stated(
+            [
+                jm.fit(TASK, run, **QUICK)
+                for run in recorded(task, np.random.default_rng(36), count)
+            ],
+            task,
+        )
+
+
+def _stated(fits: list[jm.fits.FitResult], task: jm.PrescribedLength) -> None:
+    rows: dict[str, list[tuple[float, Any]]] = {}
+    for fit in fits:
+        true = series(task)
+        for gain, phase, f in zip(GAINS, PHASES, fit.only.thirds, strict=True):
+            H = answer(task, f)
+            true |= {gain: abs(H), phase: np.degrees(np.angle(H))}
+        for name in (*LIMB, *TISSUES):
+            rows.setdefault(name, []).append((true[name], fit[name]))
+    for name, found in rows.items():
+        stated = [(p.value - t, p.stderr) for t, p in found if p.stderr is not None]
+        off, error = np.mean(stated, axis=0) if stated else (np.nan, np.nan)
+        ends = [(t, p.interval) for t, p in found if p.interval is not None]
+        held = [_holds(each, t) for t, each in ends]
+        every = [100 * (p.value / t - 1) for t, p in found]
+        print(
+            f"  {name:18s} true {found[0][0]:8.4g}  mean {np.mean(every):+5.1f} %, median"
+            f" {np.median(every):+5.1f} %; error stated {len(stated)} times,"
+            f" {100 * error / found[0][0]:.1f} %, bias over it {off / error:+.2f}; interval"
+            f" {len(ends)} times, one-sided {sum(None in each for _, each in ends)}, holds"
+            f" {100 * np.mean(held):.0f} %",
+            flush=True,
+        )
+    moved = [sum(n.startswith("rests on the prior") for n in fit.notices) for fit in fits]
+    print(f"  rests on the prior: {sum(moved)} of {len(fits)}", flush=True)
+
+
 def coverage(count: int) -> None:
     """Are the errors right: those of 64 s of the knee extension, against how far the fits scatter
     about the truth."""
@@ -562,6 +645,7 @@ PARTS: dict[str, Callable[[int], None]] = {
         richer,
         linear,
         seconds,
+        limb,
         coverage,
         time,
     )

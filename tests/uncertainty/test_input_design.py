@@ -34,7 +34,7 @@ from jaxmuscle.uncertainty._input_design import Experiment, _full_name, steps_of
 from jaxmuscle.uncertainty._multisine import Motion
 
 BASE = ("k_w", "k_z", "c_w", "c_z")
-TANGENTS = ("K_w_tangent", "tangent_stiffness")
+TANGENTS = ("K_w_tangent", "tangent_stiffness", "B0")
 SECONDS, BAND = 60.0, (0.1, 5.0)
 PULLED = TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
 FLAT = Lengthening.flat(1e-3, BAND, SECONDS)

@@ -16,6 +16,7 @@ from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import BATCH, consequences, expand, quantities
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import Identifiability
+from jaxmuscle.objective._derived import LIMB, TISSUES
 from jaxmuscle.objective._least_squares import SMALL, Minima
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
@@ -376,6 +377,18 @@ def reach_notices(
                     f" the stiffness at {lowest:.2g} Hz, or record once more with a slower motion"
                 )
     return tuple(said)
+
+
+def prior_notices(resting: Iterable[str]) -> tuple[str, ...]:
+    """The notice of numbers that a wider prior moves."""
+    names = ", ".join(n for n in resting if base_of(n) in {*LIMB, *TISSUES})
+    if not names:
+        return ()
+    return (
+        f"rests on the prior: {names}. With priors three times as wide this moves by more than half"
+        " of its standard error. The interval is that with the wide priors: report it. What to do:"
+        " move more, or record longer",
+    )
 
 
 def notices_of(

@@ -18,6 +18,7 @@ from jaxmuscle.objective._consequences import (
     expand,
     half_power_levels,
 )
+from jaxmuscle.objective._derived import LIMB, PHASES, SPLIT
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
 
@@ -40,6 +41,7 @@ FIRST, FASTER, SLOWER = 0.4, 2.5, 0.4
 # rise is within `NEAR` of what is sought: over what is left it is extrapolated as a straight line.
 GAIN, NEAR = 0.01, 0.05
 FURTHEST = 4.0  # times as far as the curvature says: beyond, an end is open
+OWN = 0.5  # of the rise, at most, that the prior gives where an end of a moved limb is stated
 
 # Of a half-power frequency.
 EACH = 16  # frequencies on either side
@@ -99,6 +101,12 @@ def intervals(
     return found
 
 
+def is_stated(problem: FitProblem, name: str) -> bool:
+    """Whether this number of a moved limb is stated however little is known of it."""
+    moved = any(part.points is not None for part in problem.parts)
+    return moved and base_of(name) in {*LIMB, *SPLIT}
+
+
 class Point(NamedTuple):
     """What a fit sees at rows of θ: data residuals, their slopes, cost `½ Σ r² + ½ Σ θ²`, tables of
     quantities."""
@@ -126,7 +134,8 @@ class Point(NamedTuple):
 
     def at(self, objective: Residuals, theta: Float[np.ndarray, "rows free"]) -> "Point":
         """What it sees at other θ, within what is looked at."""
-        return Point.of(self.problem, objective, expand(objective, np.clip(theta, -MOST, MOST)))
+        most = np.maximum(MOST, np.abs(self.theta[0]) + 1)  # the fit itself may lie far out
+        return Point.of(self.problem, objective, expand(objective, np.clip(theta, -most, most)))
 
     @property
     def gain(self) -> Float[np.ndarray, "free free"]:
@@ -236,7 +245,8 @@ def _profile_intervals(
     names, gain, prior = list(widening), here.gain, here.problem.precision
     seen_here = [here.quantity(name) for name in names]
     value, slope = (np.repeat([pair[k][0] for pair in seen_here], 2, axis=0) for k in (0, 1))
-    log = value > 0
+    # a phase may be zero
+    log = (value > 0) & np.repeat([base_of(name) not in PHASES for name in names], 2)
     slope = np.where(log[:, None], slope / np.where(log, value, 1.0)[:, None], slope)
     start = np.where(log, np.log(np.where(log, value, 1.0)), value)
 
@@ -297,11 +307,26 @@ def _profile_intervals(
     # What is left of the way is short: the root of the rise grows along it as the quantity does.
     end = moved * wanted / rise
     # A row that rose by less than half came to where the cost no longer rises: an open end.
-    good = np.isfinite(end) & (moved > 0) & (rise > 0.5 * wanted)
+    good = np.isfinite(end) & (moved > 0) & (rise > 0.5 * wanted) & _by_data(here, best, names)
     ends = [float(s * e) if fine else None for s, e, fine in zip(side, end, good, strict=True)]
     return {
         n: Interval(ends[2 * i], ends[2 * i + 1], bool(log[2 * i])) for i, n in enumerate(names)
     }
+
+
+def _by_data(here: Point, best: Rows, names: list[str]) -> np.ndarray:
+    """Whether the data, and not the prior, stop each row. It is asked of those numbers alone that
+    are stated however little is known of them: their ends are open else.
+
+    The prior of m_w does not count as one here: no record tells m_w, and its doubt is to be in all
+    intervals.
+    """
+    problem = here.problem
+    others = np.array([base_of(name) != "m_w" for name in problem.coordinates.names])
+    prior = problem.precision * np.outer(others, others)
+    pulled, before = (0.5 * np.sum((x @ prior) * x, axis=-1) for x in (best.theta, here.theta[0]))
+    asked = np.repeat([is_stated(problem, name) for name in names], 2)
+    return ~asked | (pulled - before < OWN * (best.cost - here.cost))
 
 
 def _test_interval(

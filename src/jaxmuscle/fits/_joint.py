@@ -14,7 +14,6 @@ from jaxmuscle.model._rungs import RUNGS, on_rung
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import (
     DAMPING,
-    MASSES,
     Plan,
     base_of,
     check_quantity,
@@ -24,6 +23,7 @@ from jaxmuscle.objective._arguments import (
     planned,
     settings_of,
     target_of,
+    with_masses,
 )
 from jaxmuscle.objective._derived import MEAN
 from jaxmuscle.objective._options import FitOptions
@@ -286,11 +286,8 @@ def _at_means(
     first, (mean, _) = next(iter(stated.items()))
     factor = float(tasks[first].at_force(mean)["P_w"]) / float(tasks[first]["P_w"])
     scaled = {name: times_force(task, factor) for name, task in tasks.items()}
-    if _any_moved(targets):  # displacements are known: masses are no scale
-        scaled = {
-            name: task.replace(**{m: tasks[name][m] for m in MASSES})
-            for name, task in scaled.items()
-        }
+    if _any_moved(targets):
+        scaled = {name: with_masses(task, tasks[name], factor) for name, task in scaled.items()}
     own = {
         name: scaled[name].replace(P_w=float(scaled[name]["P_w"]) * value / mean)
         for name, (value, _) in stated.items()

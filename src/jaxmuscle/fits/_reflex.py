@@ -36,7 +36,8 @@ WIDER = "What would tell: a motion that has power up to 20 or 30 Hz, or a larger
 class ReflexTest(NamedTuple):
     """`p`, how often data without a reflex look as much like one; the `gain` [N s/m] that fits best
     at each of `DELAYS`, and the `score` there, in standard errors; `least`, the gain of which nine
-    of ten are seen; `shifts` {quantity: by how many of its errors it is off if that is left out}.
+    of ten are seen; `shifts` {quantity: how far it is off if that is left out, over its value and
+    over its error}; `fitted`, whether a reflex that is seen describes the response better.
     """
 
     p: float
@@ -44,6 +45,7 @@ class ReflexTest(NamedTuple):
     score: Float[np.ndarray, " delays"]
     least: float
     shifts: dict[str, tuple[float, float]]
+    fitted: bool = True
 
     @property
     def seen(self) -> bool:
@@ -53,6 +55,12 @@ class ReflexTest(NamedTuple):
     @property
     def notice(self) -> str:
         """What has to be said of a fit without a reflex."""
+        if self.seen:
+            return (
+                f"a stretch reflex may be in these data ({probability(self.p)}), but with one the"
+                " model describes them hardly better, so it is left out. Perhaps the limb is no"
+                " two tissues in series. Compare with --reflex linear (reflex='linear')"
+            )
         none = f"no stretch reflex is seen ({probability(self.p)})"
         off = {name: each for name, each in self.shifts.items() if each[1] > 1}
         if not off:

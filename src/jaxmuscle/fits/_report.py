@@ -3,6 +3,7 @@ errors, what is undetermined. `_search.py` calls it when a search has ended.
 """
 
 import itertools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -21,6 +22,8 @@ from jaxmuscle.objective._arguments import SAME, Plan, base_of
 from jaxmuscle.objective._covariance import Identifiability, common_scales
 from jaxmuscle.objective._derived import (
     MEAN,
+    SPLIT,
+    TISSUES,
     VARIATION,
     derived_names,
     jackknife,
@@ -52,12 +55,13 @@ from ._checks import (
     notices_of,
     polish_check,
     polish_notices,
+    prior_notices,
     reach_notices,
     rivals,
     twitch_notices,
     unsettled,
 )
-from ._intervals import Interval
+from ._intervals import REACH, Interval, is_stated
 from ._model_choice import find_unseen, harmonic_test
 from ._result import Estimate, FitResult, FittedPart, Rung, Start
 from ._signal_checks import RATE
@@ -68,6 +72,8 @@ OUTPUTS = (VARIATION, MEAN)
 BASE = {"K_w0": "k_w", "K_z0": "k_z", "C_w0": "c_w", "C_z0": "c_z"}
 STRAIGHT = 0.25  # error of a log up to which a quantity is as good as linear
 VAGUE = 100.0  # from the lower to the upper end of an interval
+MOVES = 0.5  # of its error: a number that a wider prior moves further rests on the prior
+LOPSIDED = 1.7  # times as far as its error says is an end that this does not describe
 
 
 def parameter_table(
@@ -95,8 +101,9 @@ def parameter_table(
                 continue
             column = part.columns[own.index(name)]
             joint = problem.coordinates.names[column]
-            error = float(sd[column] * slope[own.index(name)]) if identifiable[column] else None
-            made = Estimate(float(value), unit_of(name), error, True, bool(identifiable[column]))
+            told = bool(identifiable[column]) or is_stated(problem, name)
+            error = float(sd[column] * slope[own.index(name)]) if told else None
+            made = Estimate(float(value), unit_of(name), error, True, told)
             differs = joint in free and abs(free[joint].value - made.value) > SAME * abs(made.value)
             free[f"{joint}@{part.name}" if differs else joint] = made
     held = {}
@@ -109,6 +116,7 @@ def parameter_table(
 
 
 def derived_table(
+    problem: FitProblem,
     part: Part,
     values: Mapping[str, Any],
     slopes: Mapping[str, Any],
@@ -123,10 +131,11 @@ def derived_table(
     sampling error.
     """
     table = {}
-    for name in (n for n in derived_names(part.task, len(part.target.bins) > 0) if n in values):
+    names = derived_names(part.task, len(part.target.bins) > 0, part.points is not None)
+    for name in (n for n in names if n in values):
         g = np.asarray(slopes[name])
         free = bool(np.any(g != 0))
-        determined = free and known.determines(g)
+        determined = free and (known.determines(g) or is_stated(problem, name))
         stderr = (
             float(np.hypot(np.sqrt(g @ covariance @ g), sampling.get(name, 0.0)))
             if determined
@@ -232,6 +241,71 @@ def with_intervals(table: dict[str, Estimate], ends: Mapping[str, Interval]) -> 
             )
         found[name] = p
     return found
+
+
+def as_stated(
+    ended: Endpoint,
+    stage: Stage,
+    tables: tuple[dict[str, Estimate], dict[str, Estimate]],
+    ends: Mapping[str, Interval],
+    max_steps: int,
+) -> tuple[tuple[dict[str, Estimate], ...], Mapping[str, Estimate]]:
+    """The tables with their intervals, and those numbers of a moved limb that rest on the prior:
+    these have the intervals of wide priors. Where an error does not describe the interval, the
+    interval stands alone."""
+    stated = {
+        n: p
+        for n, p in (tables[0] | tables[1]).items()
+        if n in ends and is_stated(ended.problem, n)
+    }
+    resting = by_prior(ended, stage, stated, max_steps) if stated else {}
+    full = tuple(with_intervals(table, ends) for table in tables)
+    full = tuple(table | {n: p for n, p in resting.items() if n in table} for table in full)
+    alone = lopsided({n: p for table in full for n, p in table.items() if n in stated})
+    return tuple(
+        {n: interval_alone(p) if n in alone else p for n, p in table.items()} for table in full
+    ), resting
+
+
+def by_prior(
+    ended: Endpoint, stage: Stage, stated: Mapping[str, Estimate], max_steps: int
+) -> dict[str, Estimate]:
+    """Those of the stated numbers that move by more than `MOVES` of their error where the prior is
+    wider, with the intervals that they have then."""
+    wide = ended.with_wide_priors(stage.minima, max_steps)
+    if not np.all(np.isfinite(wide.found.residuals)):
+        return {}
+    here, there = (each.values_of(stated) for each in (ended, wide))
+    moved = [n for n, p in stated.items() if abs(there[n] - here[n]) > MOVES * (p.stderr or 0.0)]
+    ends = wide.intervals(moved, ended.widening)
+    values = {n: Estimate(there[n], stated[n].unit, stated[n].stderr) for n in moved}
+    return {
+        n: eqx.tree_at(lambda e: e.value, p, stated[n].value)
+        for n, p in with_intervals(values, ends).items()
+    }
+
+
+def lopsided(stated: Mapping[str, Estimate]) -> set[str]:
+    """Those of the stated numbers whose errors do not describe their intervals: an end is open, or
+    more than `LOPSIDED` times as far as the error says.
+
+    Of the tissues all, if it is one: their numbers lie on one bent ridge. To state those alone that
+    look straight would select them by what they came out as.
+    """
+
+    def is_described(p: Estimate) -> bool:
+        ends = [math.inf if end is None else abs(end - p.value) for end in p.interval or ()]
+        return bool(ends) and max(ends) <= LOPSIDED * REACH * (p.stderr or 0.0)
+
+    found = {n for n, p in stated.items() if not is_described(p)}
+    if any(base_of(n) in TISSUES for n in found):
+        found |= {n for n in stated if base_of(n) in SPLIT}
+    return found
+
+
+def interval_alone(p: Estimate) -> Estimate:
+    """The number without its error."""
+    return Estimate(p.value, p.unit, None, p.free, False, p.interval)
 
 
 STRETCH = 5.0
@@ -343,7 +417,13 @@ def report_fit(
         )
     tables = [
         derived_table(
-            part, values | _observed(part, m.each), slopes, jackknife(m.each), covariance, known
+            problem,
+            part,
+            values | _observed(part, m.each),
+            slopes,
+            jackknife(m.each),
+            covariance,
+            known,
         )
         for part, values, slopes, m in zip(
             problem.parts, found.values, found.slopes, made, strict=True
@@ -360,14 +440,17 @@ def report_fit(
         moved |= {n for n in parameters | derived if base_of(n).startswith("harmonic_")}
         other += (may_be_elsewhere(share),)
     unseen, why = find_unseen(problem, parameters | derived)
-    moved |= too_curved(problem, derived, known) | unseen
+    curved = too_curved(problem, derived, known)
+    moved |= {n for n in curved if not is_stated(problem, n)} | unseen
     parameters, derived = (
         widened(without_errors(moved, table), ended.widening) for table in (parameters, derived)
     )
     ends = ended.intervals(
         [n for n, p in (parameters | derived).items() if p.stderr and n in {*derived, *names}]
     )
-    parameters, derived = (with_intervals(table, ends) for table in (parameters, derived))
+    (parameters, derived), resting = as_stated(
+        ended, stages[-1], (parameters, derived), ends, plan.max_steps
+    )
     polish = polish_check(problem, stages, derived)
     parts, notices = _parts(plan, stages, tasks, ended, made, polish)
     describes = judgement is None or judgement.adequate
@@ -398,6 +481,7 @@ def report_fit(
             *ended.judged[1],
             *mass_notices(problem.coordinates, theta),
             *reach_notices(derived, parts),
+            *prior_notices(resting),
             *(narrow_notices(derived, parts) if describes else ()),
             *polish_notices(polish),
             *notices,

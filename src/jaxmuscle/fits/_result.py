@@ -32,7 +32,7 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._derived import MEAN, derived_names
+from jaxmuscle.objective._derived import MEAN, derived_names, thirds
 from jaxmuscle.objective._options import METHODS
 
 if TYPE_CHECKING:
@@ -382,7 +382,7 @@ class Estimate(Shown, eqx.Module):
 
     def _card(self) -> Card:
         unit = self.unit if self.unit != "1" else ""
-        known = [self.error_in_words()] if self.stderr is None else []
+        known = [self.error_in_words()] * (self.stderr is None and self.interval is None)
         known += (
             [f"95 % interval {self.interval_in_words()} {unit}".strip()]
             if self.interval_in_words()
@@ -503,6 +503,16 @@ class FittedPart(eqx.Module):
         stiffness; or None."""
         off = self.stiffness_residual
         return None if off is None else float(np.mean(np.abs(off) ** 2) / 2)
+
+    @property
+    def thirds(self) -> tuple[float, ...]:
+        """Frequencies [Hz] of `gain_low`, `gain_middle` and `gain_high`, and of the phases; none
+        without a dynamic stiffness."""
+        if self.target.stiffness is None:
+            return ()
+        known = self.target.stiffness.known
+        at = thirds(known.frequency, known.value, known.stderr)
+        return tuple(map(float, known.frequency[at]))
 
     def stiffness_columns(self) -> dict[str, Any]:
         """What `stiffness.csv` holds, by column; nothing where there is no dynamic stiffness."""
@@ -889,7 +899,9 @@ class FitResult(Result, eqx.Module):
     def derived_names(self) -> tuple[str, ...]:
         """Names that derived quantities have in this fit."""
         return (
-            derived_names(self.task, self.only.fitted.size > 0)
+            derived_names(
+                self.task, self.only.fitted.size > 0, self.only.target.stiffness is not None
+            )
             if len(self.parts) == 1
             else tuple(self.derived)
         )

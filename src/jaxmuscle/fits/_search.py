@@ -52,6 +52,7 @@ STILL = 2e-3
 # Data that are fitted together. How many must not depend on who works: the last bits of a fit may
 # hang on its neighbours. With 32 starts each they fill the programs' rows; more gain nothing.
 TOGETHER = 4
+REFLEX_MARGIN = 4.0  # of AIC, by which a model with a reflex that is seen must be better
 RENEWALS = 2  # of the target of a moved record, where a richer model than the base one was chosen
 TOLD = {
     "trying starts": "searching from all starting points",
@@ -161,6 +162,9 @@ class _Search:
             rung = rung_of(ended, number)
             name = f"{rung.model} + {REFLEX}"
             rung = msgspec.structs.replace(rung, model=name, chosen=True)
+            if models.reflex == "auto" and rung.aic > found.rung.aic - REFLEX_MARGIN:
+                self.reflex = test._replace(fitted=False)
+                return
             self.keep(Climbed(plan, stages, reached, ended, rung))
             muscle = _reached(plan, stages)[0]
         without = [msgspec.structs.replace(r, chosen=False) for r in self.ladder]
@@ -199,7 +203,7 @@ def search(
             "checking with new simulations" if plan.check_seeds else "computing the errors", 0.8
         )
         result = report_fit(plan, run.stages, run.ladder, ended=ended)
-        if run.reflex is not None and not run.reflex.seen:
+        if run.reflex is not None and not (run.reflex.seen and run.reflex.fitted):
             said = (run.reflex.notice, *result.notices)
             result = dataclasses.replace(result, notices=said)
         if answer is not None and not plan.check_seeds:

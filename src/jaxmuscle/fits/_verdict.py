@@ -5,7 +5,9 @@ of the model and the report read it.
 
 import dataclasses
 import functools
+from collections.abc import Iterable
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +19,7 @@ from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import probability
 from jaxmuscle.objective._consequences import Consequences, Expansion, consequences
 from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
+from jaxmuscle.objective._least_squares import Minima, least_squares
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import PartResiduals, Residuals, further_residuals
 from jaxmuscle.response._expected import Moments
@@ -29,6 +32,7 @@ from ._stages import Stage, expand_at_best
 
 ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
 REPLICATES = 999
+WIDER = 3.0  # the priors of a second descent, which shows what rests on them
 SAMPLES = 5  # of the key, for what is simulated beside the samples
 ELSEWHERE = (
     "The misfit is in the other data. What comes from these may still be right: fit them alone, and"
@@ -51,10 +55,33 @@ class Endpoint:
         """The best point of a stage."""
         return cls(problem, stage.objective, expand_at_best(stage.objective, stage.minima))
 
+    def with_wide_priors(self, minima: Minima, max_steps: int) -> "Endpoint":
+        """Where a descent from the same minima ends if all standard deviations of the prior are
+        `WIDER` times as large."""
+        rows = tuple(row / WIDER for row in self.problem.damping)
+        prior = self.problem.prior / WIDER**2
+        problem = dataclasses.replace(self.problem, prior=prior, damping=rows)
+        objective = eqx.tree_at(lambda o: o.prior_root, self.objective, problem.prior_root)
+        found = least_squares(objective, minima.s, max_steps)
+        return Endpoint.of(problem, Stage("wide priors", objective, found))
+
     @functools.cached_property
     def found(self) -> Consequences:
         """Residuals and derived quantities with their slopes."""
         return consequences(self.objective, self.seen)
+
+    def values_of(self, names: Iterable[str]) -> dict[str, float]:
+        """Free parameters and derived quantities."""
+        tables = self.problem.by_name(self.found.values)
+        free = self.problem.coordinates.names
+        natural = self.problem.coordinates.values_of(self.seen.theta)
+        known = dict(zip(free, natural, strict=True))
+        # of several targets, a quantity that is the same for all is that of the first
+        first = f"@{self.problem.parts[0].name}"
+        return {
+            n: float(known[n] if n in known else tables[n] if n in tables else tables[n + first])
+            for n in names
+        }
 
     @functools.cached_property
     def scatter(self) -> Float[np.ndarray, "residuals residuals"]:
@@ -115,9 +142,10 @@ class Endpoint:
         ]
         return max(1.0 if self.adequacy is None else self.adequacy.widening, *unsteady, 1.0)
 
-    def intervals(self, names: list[str]) -> dict[str, Interval]:
-        """95 % intervals of these quantities; computed once."""
-        new = {name: self.widening for name in names if name not in self._ends}
+    def intervals(self, names: Iterable[str], widening: float | None = None) -> dict[str, Interval]:
+        """95 % intervals of these quantities; computed once. `widening`, where it is known."""
+        factor = self.widening if widening is None else widening
+        new = {name: factor for name in names if name not in self._ends}
         where = self.problem, self.objective, self.seen, self.covariance
         self._ends.update(intervals(*where, new))
         return {n: self._ends[n] for n in names if n in self._ends}

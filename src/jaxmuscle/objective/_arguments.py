@@ -146,13 +146,23 @@ def at_mean(
     free = (*options.also_free, level)
     moved = task.at_force(stated[0])
     factor = float(moved["m_w"]) / float(task["m_w"])
-    # masses are not in ratio to forces where displacements are known
     if target.stiffness is not None:
-        moved = moved.replace(**{name: task[name] for name in MASSES})
+        moved = with_masses(moved, task, factor)
         if arm is not None:
             moved = _on_joint(task, moved, response, arm)
             return moved, dataclasses.replace(options, mean_force=stated, also_free=free)
     return moved, dataclasses.replace(options, mean_force=stated, also_free=free, carried=factor)
+
+
+def with_masses(carried: AbstractTask, task: AbstractTask, factor: float) -> AbstractTask:
+    """A task that was carried to `factor` times the force, with the masses that it had: they are in
+    no ratio to forces where displacements are known.
+
+    Damping goes with √factor then. So the damping ratio C / 2√(K m) stays.
+    """
+    kept = {name: task[name] for name in MASSES}
+    damping = {name: task[name] * np.sqrt(factor) for name in ("c_w", "c_z")}
+    return carried.replace(**kept, **damping)
 
 
 def _on_joint(

@@ -20,7 +20,14 @@ from jaxmuscle.response._mechanics import Near, in_parts, value_and_slopes
 from jaxmuscle.response._rows import mechanical_rows
 from jaxmuscle.response._transfer import half_power_level
 
-from ._derived import derived_names, has_tangents, of_muscle, of_spectrum
+from ._derived import (
+    derived_names,
+    has_tangents,
+    of_muscle,
+    of_response,
+    of_spectrum,
+    thirds,
+)
 from ._moment_models import Linear
 from ._residuals import Data, PartResiduals, Residuals, data_residuals, free_size
 
@@ -114,7 +121,13 @@ def _of_part(
     along = {name: x * slopes(values) for name, x in along.items()}
     (residuals, spectral), (jacobian, by_spectrum) = _of_spectra(part, seen, known)
     found, along = known | muscle | spectral, along | by_spectrum
-    names = derived_names(part.task)
+    points, measured = part.model.points, part.data.stiffness
+    if points is not None and measured is not None:
+        value, stderr = map(np.asarray, measured)
+        at = thirds(np.asarray(points), value[0] + 1j * value[1], stderr)
+        response, by = of_response(seen.moments.stiffness, seen.slopes.stiffness, value, at)
+        found, along = found | response, along | by
+    names = derived_names(part.task, response=points is not None)
     return (
         residuals,
         jacobian,

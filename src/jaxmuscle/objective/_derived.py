@@ -20,7 +20,15 @@ from jaxmuscle.response._mechanics import Operating
 from jaxmuscle.response._transfer import half_power_frequency
 from jaxmuscle.spectra._fluctuations import BANDS, EDGES, in_bands
 
-TANGENTS = ("K_w_tangent", "tangent_stiffness")
+TANGENTS = ("K_w_tangent", "tangent_stiffness", "B0")
+# of the dynamic stiffness, in the thirds of the band that was moved
+GAINS = ("gain_low", "gain_middle", "gain_high")
+PHASES = ("phase_low", "phase_middle", "phase_high")
+# what holds of a moved limb whatever its tissues are, and what if there are two in series and
+# nothing beside them
+LIMB = ("tangent_stiffness", "B0", "m_z", *GAINS, *PHASES)
+TISSUES = ("K_w_tangent", "K_z0", "C_w0", "C_z0")
+SPLIT = (*TISSUES, "K_w0", "k_w", "k_z", "c_w", "c_z")  # the same by all its names
 MEAN, VARIATION = "model_mean", "model_coefficient_of_variation"
 DERIVED = (
     "corner_frequency",
@@ -37,6 +45,8 @@ DERIVED = (
     "C_w0",
     "C_z0",
     *TANGENTS,
+    *GAINS,
+    *PHASES,
     VARIATION,
     MEAN,
     *BANDS,
@@ -54,9 +64,13 @@ UNITS = {
     "C_z0": "N s/m",
     "K_w_tangent": "N/m",
     "tangent_stiffness": "N/m",
+    "B0": "N s/m",
+    **dict.fromkeys(GAINS, "N/m"),
+    **dict.fromkeys(PHASES, "deg"),
 }
 
 
+SEEN = 5.0  # standard errors: by chance a point is larger in four of a million cases
 MEANINGS = {
     "corner_frequency": "where the slow response of the muscle falls off",
     "half_power_frequency": "where muscle and activation together let half the power through",
@@ -73,7 +87,13 @@ MEANINGS = {
     "C_w0": "active damping when nothing moves",
     "C_z0": "passive damping when nothing moves",
     "K_w_tangent": "active stiffness as displaced in the hold",
-    "tangent_stiffness": "stiffness of both tissues in series, H(0)",
+    "tangent_stiffness": "stiffness of the limb when pulled slowly, H(0)",
+    "B0": "damping of the limb when pulled slowly, Im H / 2πf for f -> 0, without a reflex",
+    **{
+        f"{what}_{third}": f"{what} of the dynamic stiffness in the {words} third of the band"
+        for what in ("gain", "phase")
+        for third, words in (("low", "lowest"), ("middle", "middle"), ("high", "highest"))
+    },
     VARIATION: "standard deviation over mean of the model's output",
     MEAN: "mean of the model's output",
     **{
@@ -96,9 +116,9 @@ OF_SPECTRUM = {
 }
 
 
-def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
+def derived_names(task: Any, spectrum: bool = True, response: bool = False) -> tuple[str, ...]:
     """The derived quantities that a task has; without a spectrum among the data those of the muscle
-    alone."""
+    alone, with a dynamic stiffness also its gain and phase."""
     frequency, resonances = (
         task.settings.frequency,
         sum(isinstance(n, ResonantNoise) for n in task.noise.components),
@@ -112,6 +132,7 @@ def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
         if there >= 0.5 * width
     }
     missing = set(BANDS) - bands | (set() if spectrum else OF_SPECTRUM)
+    missing |= set() if response else {*GAINS, *PHASES}
     missing |= set() if task.activation is not None else {"contraction_time"}
     missing |= set() if has_tangents(task) else {*TANGENTS}
     missing |= (
@@ -131,20 +152,62 @@ def has_tangents(task: Any) -> bool:
 
 
 def tangents(task: Any, mean: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
-    """Stiffness of the active tissue [N/m] where the mean force stretches it, and of both tissues,
-    slowly pulled.
+    """Stiffness of the active tissue [N/m] where the mean force stretches it, stiffness [N/m] and
+    damping [N s/m] of both tissues, slowly pulled.
 
-    K_w_tangent = d(K_w x_w)/dx_w = k_w (x_ref² + 3 x_w²),   x_w = x_z + mean / K_z(x_z)
-    tangent_stiffness = H(0) = a T / (T + K_z(x_z)),   T = K_w_tangent,   a = K_z(x_z) + 2 k_z x_z
-    (x_z - x_w)
+        K_w_tangent = d(K_w x_w)/dx_w = k_w (x_ref² + 3 x_w²),   x_w = x_z + mean / K_z(x_z)
+        H(s) = (a + C_z s) (T + C_w s) / (T + K_z + (C_w + C_z) s) + O(s²),   T = K_w_tangent
+        tangent_stiffness = H(0) = a T / (T + K_z),   a = K_z(x_z) + 2 k_z x_z (x_z - x_w)
+        B0 = H'(0) = (C_z T (T + K_z - a) + C_w a K_z) / (T + K_z)²
+
+    At x_z = 0 is a = K_z, and B0 = (C_z T² + C_w K_z²) / (T + K_z)².
     """
     x_z = task.x_z(jnp.asarray(HOLD)) if isinstance(task.x_z, AbstractSignal) else task.x_z
     k_w, k_z, x_ref_w, x_ref_z = (task[name] for name in ("k_w", "k_z", "x_ref_w", "x_ref_z"))
     passive = k_z * (x_ref_z**2 + x_z**2)
     x_w = x_z + mean / passive
     active = k_w * (x_ref_w**2 + 3 * x_w**2)
-    slope = passive + 2 * k_z * x_z * (x_z - x_w)
-    return {"K_w_tangent": active, "tangent_stiffness": slope * active / (active + passive)}
+    slope, both = passive + 2 * k_z * x_z * (x_z - x_w), active + passive
+    C_w, C_z = (task[f"c_{j}"] * task[f"v_ref_{j}"] ** 2 for j in "wz")
+    damping = (C_z * active * (both - slope) + C_w * slope * passive) / both**2
+    return {
+        "K_w_tangent": active,
+        "tangent_stiffness": slope * active / both,
+        "B0": damping,
+    }
+
+
+def thirds(frequency: np.ndarray, value: np.ndarray, stderr: np.ndarray) -> np.ndarray:
+    """Which points of a measured dynamic stiffness stand for the thirds of the band that was moved:
+    those nearest to their middles, on a log scale.
+
+    The band goes from the first to the last point that is more than `SEEN` standard errors large;
+    over all points where none is.
+    """
+    seen = np.flatnonzero(np.abs(value) > SEEN * stderr)
+    low, high = np.log(frequency[seen[[0, -1]] if len(seen) else [0, -1]])
+    middles = low + (high - low) * np.array([1, 3, 5]) / 6
+    return np.argmin(np.abs(np.log(frequency)[:, None] - middles), axis=0)
+
+
+def of_response(
+    stiffness: Float[np.ndarray, "rows 2 points"],
+    slopes: Float[np.ndarray, "rows 2 points own"],
+    measured: Float[np.ndarray, "2 points"],
+    at: np.ndarray,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Gain [N/m] and phase [deg] of a dynamic stiffness at three points, and their slopes. A phase
+    is within half a turn of the measured one, so that it does not jump."""
+    H, dH = (np.asarray(x)[:, 0] + 1j * np.asarray(x)[:, 1] for x in (stiffness, slopes))
+    seen = measured[0] + 1j * measured[1]
+    found, along = {}, {}
+    for gain, phase, k in zip(GAINS, PHASES, at, strict=True):
+        h, dh, turn = H[:, k], dH[:, k], seen[k] / np.abs(seen[k])
+        relative = dh / h[:, None]
+        found[gain], along[gain] = np.abs(h), np.abs(h)[:, None] * relative.real
+        found[phase] = np.degrees(np.angle(h / turn) + np.angle(turn))
+        along[phase] = np.degrees(relative.imag)
+    return found, along
 
 
 def of_muscle(

@@ -24,11 +24,12 @@ from jaxmuscle.data._recording import FOUND, UNRAMPED
 from jaxmuscle.data._second_order import UNITS
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._checks import CONVERGED
+from jaxmuscle.fits._intervals import HALF_POWER
 from jaxmuscle.fits._result import RELATIVE, Estimate, FitResult, FittedPart, once
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import REFLEX, model_name
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._derived import MEANINGS, VARIATION
+from jaxmuscle.objective._derived import GAINS, LIMB, MEANINGS, PHASES, TISSUES, VARIATION
 from jaxmuscle.spectra._bin_law import ENOUGH, samples_of_trials
 from jaxmuscle.spectra._fluctuations import BANDS, in_bands
 
@@ -58,14 +59,20 @@ RHYTHMS = {
     "reflex_delay": "reflex, delay",
     "reflex_time": "reflex, contraction time",
 }
-STIFFNESS = ("tangent_stiffness", "K_w_tangent", "K_z0", "C_w0", "C_z0", "m_z")
+OF_LIMB = {
+    "tangent_stiffness": "tangent_stiffness, H(0)",
+    "B0": "B0, damping as f -> 0",
+    "m_z": "m_z, moved mass",
+}
+IN_SERIES_ONLY = "if there are two tissues in series and nothing beside them:"
 # what a number that the data do not determine belongs to, by the beginning of its name
 KINDS = {
     "active stiffness": ("k_w", "K_w"),
     "passive stiffness": ("k_z", "K_z"),
     "active damping": ("c_w", "C_w"),
     "passive damping": ("c_z", "C_z"),
-    "stiffness of both tissues": ("tangent_stiffness",),
+    "stiffness of the limb": ("tangent_stiffness", "gain_"),
+    "damping of the limb": ("B0", "phase_"),
     "mass of the active tissue": ("m_w",),
     "moved mass": ("m_z",),
     "lengths": ("x_ref",),
@@ -80,7 +87,7 @@ KINDS = {
     "resonance": ("resonance_",),
     "": ("model_", *BANDS),  # these are measured
 }
-MOST = 3  # checks that are printed
+MOST, LINES = 3, 24  # checks that are printed, lines of one target
 CHOSEN = (
     "the model was chosen for these data alone: `jaxmuscle study` fits all people with one model"
 )
@@ -103,11 +110,12 @@ def fit_card(result: FitResult) -> Card:
     for name, p in result.as_shown(once(fixed, result.found)).items():
         if silent and base_of(name).startswith("harmonic_"):
             continue
-        state = ("determined" if p.stderr is not None else "not determined") if p.free else "fixed"
+        state = "not determined" if p.interval is None else "interval alone"
+        state = ("determined" if p.stderr is not None else state) if p.free else "fixed"
         row, unit = PARAMETERS.get(base_of(name)), "" if p.unit == "1" else p.unit
         words = MEANINGS.get(base_of(name), "") if row is None else row.meaning.partition(";")[0]
         of_model.append((name, p.in_words(), p.interval_in_words(), unit, state, words))
-    order = ("determined", "not determined", "fixed")
+    order = ("determined", "interval alone", "not determined", "fixed")
     rows += sorted(of_model, key=lambda row: order.index(row[4]))
     remarks = (
         f"{_head(result)}: {result.message}",
@@ -140,8 +148,8 @@ def fit_text(result: FitResult, saved: str | None = None) -> str:
     missed = result.success and result.adequate is False
     lines = [line for name, part in result.parts.items() for line in _read(result, name, part)]
     for name, part in result.parts.items():
-        words = FEW if missed or part.stiffness is not None else SHOWN
-        if len(result.parts) > 1:
+        words = FEW if missed else SHOWN
+        if len(result.parts) > 1 or (part.stiffness is not None and not missed):
             words = {n: FEW[n] for n in ("mean", "coefficient_of_variation")}
         lines += _measured(result, name, part, words)
     lines += _judged(result)
@@ -150,7 +158,8 @@ def fit_text(result: FitResult, saved: str | None = None) -> str:
     checks = _checks(result)
     several, hidden = len(result.parts) > 1, len(checks)
     if not missed:
-        shown = 1 if several else MOST
+        room = LINES - 1 - len(folded(lines).splitlines())
+        shown = 1 if several else max(1, min(MOST, room))
         lines, hidden = [*lines, *checks[:shown]], max(0, hidden - shown)
     more = "print(result.details())" if saved is None else f"jaxmuscle fit {saved} -v"
     noted = f", {hidden} more notice{'s' * (hidden > 1)}" * (hidden > 0)
@@ -228,29 +237,26 @@ def _results(result: FitResult, saved: str | None) -> list[str]:
     recorded = any(is_recorded(part.target.measured) for part in result.parts.values())
     several = len(result.parts) > 1
     moved = any(part.stiffness is not None for part in result.parts.values())
-    stated = (*RHYTHMS, *STIFFNESS * moved)
+    limb = {n: p for n, p in every.items() if base_of(n) in {*LIMB, *TISSUES}} if moved else {}
+    rhythms = {n: words for n, words in RHYTHMS.items() if not (moved and n == HALF_POWER)}
     rows = {
         name: p
         for name, p in shown.items()
-        if base_of(name) in stated
+        if base_of(name) in rhythms
         or ((several or not recorded) and not moved and name in result.free)
         or (base_of(name) not in {*PARAMETERS, *MEANINGS})  # of an own muscle
     }
-    lines = []
+    lines = _of_limb(result, limb)
     if (p := result.harmonic_p_value) is not None:
         seen = "seen" if p < 0.05 else "none seen"
         lines.append(f"  {'regular rhythm (harmonic)':<{WIDE}}{seen}, {probability(p)}")
-    for name, p in rows.items():
-        base, at, target = name.partition("@")
-        words = RHYTHMS.get(base, base) + f", {target}" * bool(at)
-        unit = f" {p.unit}" * (p.unit not in ("1", ""))
-        line = f"  {words:<{WIDE}}{p.in_words() + unit:<25} {p.interval_in_words()}"
-        lines.append(line.rstrip())
+    lines += [_row(name, p, rhythms) for name, p in rows.items()]
+    rows |= {n: p for n, p in limb.items() if p.stderr is not None or p.interval is not None}
     lines += [f"   {_per_newton(result, rows)}"] * bool(_per_newton(result, rows))
     lines += _about_axis(result)
     if recorded and not moved and len(result.ladder) > 1:
         lines.append(f"  {CHOSEN}")
-    loose = [n for n, p in every.items() if p.stderr is None and p.free]
+    loose = [n for n, p in every.items() if p.stderr is None and p.free and n not in rows]
     if unknown := unknown_kinds(loose, rows):
         lines.append(f"NOT KNOWN from these data: {', '.join(unknown)}")
         command = f"jaxmuscle identifiability {saved}"
@@ -260,7 +266,39 @@ def _results(result: FitResult, saved: str | None) -> list[str]:
     return lines
 
 
-def _about_axis(result: FitResult, wide: int = WIDTH) -> list[str]:
+def _of_limb(result: FitResult, found: Mapping[str, Estimate]) -> list[str]:
+    """First what holds of a moved limb whatever its tissues are, then what if there are two in
+    series; of what is known the value with its error, or the interval alone."""
+    known = {n: p for n, p in found.items() if p.stderr is not None or p.interval is not None}
+    whatever = [n for base in LIMB for n in known if base_of(n) == base]
+    lines = [_row(n, known[n], OF_LIMB) for n in whatever if base_of(n) not in {*GAINS, *PHASES}]
+    for key, part in result.parts.items():
+        at = f"@{key}" * (len(result.parts) > 1)
+        # of few points some are the same; of a held record there is none
+        pairs = dict(zip(part.thirds, zip(GAINS, PHASES, strict=True), strict=False))
+        for f, pair in pairs.items():
+            both = [_briefly(known[n + at]) for n in pair if n + at in known]
+            lines += [f"  {f'H({f:.2g} Hz)':<{WIDE}}{', '.join(both)}"] * bool(both)
+    tissues = [_row(n, known[n], {}) for base in TISSUES for n in known if base_of(n) == base]
+    return [*lines, *[f" {IN_SERIES_ONLY}"] * bool(tissues), *tissues]
+
+
+def _row(name: str, p: Estimate, words: Mapping[str, str]) -> str:
+    """A number with its interval."""
+    base, at, target = name.partition("@")
+    said = words.get(base, base) + f", {target}" * bool(at)
+    interval = p.interval_in_words() if p.stderr is not None else ""
+    return f"  {said:<{WIDE}}{_briefly(p):<25} {interval}".rstrip()
+
+
+def _briefly(p: Estimate) -> str:
+    """Value and error, or the interval alone where no error describes it."""
+    alone = p.stderr is None and p.interval is not None
+    said = p.interval_in_words() if alone else p.in_words()
+    return said + f" {p.unit}" * (p.unit not in ("1", ""))
+
+
+def _about_axis(result: FitResult, wide: int = WIDE) -> list[str]:
     """The numbers of a joint: those of stiffness, damping and mass times the square of the lever
     arm."""
     responses = (part.target.stiffness for part in result.parts.values())
@@ -270,7 +308,8 @@ def _about_axis(result: FitResult, wide: int = WIDTH) -> list[str]:
     units = dict(zip(UNITS["N/m"], UNITS["N m/rad"], strict=True))
     lines = [f"  About the axis of the joint (those in N and m are at {arm:g} m from it):"]
     for name, p in result.as_shown(result.determined).items():
-        if base_of(name) in (*STIFFNESS, "reflex_gain") and p.unit in units:
+        own = {*LIMB, *TISSUES, "reflex_gain"} - set(GAINS)
+        if base_of(name) in own and p.unit in units:
             one = p.times(arm**2, units[p.unit])
             number = f"{one.in_words()} {one.unit}"
             lines.append(f"  {name:<{wide}}{number:<25} {one.interval_in_words()}".rstrip())
@@ -390,6 +429,11 @@ def _whole_model(result: FitResult) -> list[str]:
     lines += _about_axis(result, 18)
     lines += [f"  {sentence}" for sentence in (*_counted(rows, every), *_by_band(result, bands))]
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
+    alone = {name: p for name, p in loose.items() if p.interval is not None}
+    if alone:
+        title = "state the interval alone: no error describes it"
+        lines += _table(title, alone, " 95 % interval    ")
+    loose = {name: p for name, p in loose.items() if name not in alone}
     if loose:
         title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
         lines += [*_table(title, loose), *(f"  {sentence}" for sentence in _counted(loose, every))]
@@ -405,12 +449,15 @@ def _of_scale(result: FitResult) -> list[str]:
     lines = []
     if factor := result.settings.get("carried"):
         moved = any(part.stiffness is not None for part in result.parts.values())
-        what = "P_w, stiffness" if moved else "P_w, masses (those that you did not fix), stiffness"
+        times = f"multiplied by {factor:.3g}"
+        what = (
+            f"P_w and stiffness were {times}, damping by its root {np.sqrt(factor):.3g}"
+            if moved
+            else f"P_w, masses (those that you did not fix), stiffness and damping were {times}"
+        )
         lines.append(
-            f"before the fit {what} and damping were multiplied by {factor:.3g}, so that the"
-            " muscle has the measured mean force"
-            + " (mean_force=False leaves the mean out)"
-            * (not moved)
+            f"before the fit {what}, so that the muscle has the measured mean force"
+            + " (mean_force=False leaves the mean out)" * (not moved)
         )
     lines += _held(result)
     if result.per_newton:

@@ -4,7 +4,7 @@ import itertools
 
 from jaxmuscle._common.text import probability
 from jaxmuscle.fits._result import Rung
-from jaxmuscle.model._rungs import QUIET, RICHER
+from jaxmuscle.model._rungs import QUIET, REFLEX, RICHER
 
 
 def ladder_table(ladder: tuple[Rung, ...], datum: str) -> list[str]:
@@ -45,7 +45,9 @@ def explain_choice(
             f"the spectrum shows a tremor{' and a slower peak' * slower}, so the first model tried"
             f" has {'two resonances' if slower else 'a resonance'}"
         )
-    if numbers[0] == QUIET and len(ladder) > 1:
+    if any(rung.model.endswith(REFLEX) for rung in ladder):
+        said.append("the response shows a stretch reflex, so it was fitted, too")
+    if numbers[0] == QUIET and numbers[-1] > QUIET:
         said.append("the slow part alone was fitted first. Its spectrum shows a line, or it misses")
         said[-1] += " the data: so richer models were tried"
     elif numbers[0] < first:
