@@ -83,7 +83,7 @@ def show_stiffness(ax: Axes, path: Path) -> None:
     """Real and imaginary part of force over displacement, and K, B, I with their errors."""
     recording = jm.load_recording(path, **jm.data.two_channels(path)).steady()
     response, found = recording.frequency_response(), recording.second_order()
-    f = np.linspace(0, response.frequency[-1], 200)
+    f = np.linspace(0, 12.0, 200)
     s = 2j * np.pi * f
     line = found["K"].value + found["B"].value * s + found["I"].value * s**2
     known = 2 * response.stderr < response.gain
