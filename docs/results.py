@@ -107,7 +107,7 @@ def show_stiffness(ax: Axes, path: Path) -> None:
         for (name, m), digits in zip(found.items(), (0, 1, 2), strict=True)
     )
     ax.text(0.04, 0.03, words, transform=ax.transAxes, va="bottom", ha="left")
-    ax.set(title="A limb that a motor moves", xlabel="Frequency (Hz)", xlim=(0, f[-1] + 0.4))
+    ax.set(title="A limb that a motor moves", xlabel="Frequency (Hz)", xlim=(0, 13))
     ax.set_ylabel("Force over displacement (N/m)")
     ax.set_ylim(-1700, 2300)
     ax.legend(loc="upper left", ncols=1)
