@@ -127,7 +127,7 @@ def test_a_message_quotes_no_whole_file(tmp_path):
     path = tmp_path / "study.csv"
     path.write_text("x" * 100_000)
     result = run("study", path, "--out", tmp_path / "out")
-    refused(result, "line 1: unknown column 'xxx")
+    refused(result, "line 1: needs a column file (found: xxx")
     assert len(result.stderr) < 1000
 
 

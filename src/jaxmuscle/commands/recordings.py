@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 import jaxmuscle as jm
 from jaxmuscle._common.inputs import looked_at
 from jaxmuscle._common.units import NEWTONS
-from jaxmuscle.data._perturbed import LEVER_ARM
-from jaxmuscle.data._recording_table import measured_in
 
 from .console import say_notice
 from .options import PERTURBED, READING, band_of
@@ -83,6 +81,8 @@ def perturbed(reading: dict[str, Any]) -> bool:
 def moved_by_motor(paths: Sequence[str], reading: dict[str, Any]) -> bool:
     """Whether no column is named, and a file holds force and a displacement that moves; said if
     so."""
+    from jaxmuscle.data._recording_table import measured_in
+
     if reading["column"] is not None:
         return False
     for table in tables_of(paths, reading):
@@ -159,6 +159,8 @@ def read_with_holds(
 ) -> "tuple[list[PerturbedRecording], Trials]":
     """Records of a moved insertion and those of the same person with the insertion held, which have
     the force alone."""
+    from jaxmuscle.data._perturbed import LEVER_ARM
+
     tables, held_tables = tables_of(paths, reading), tables_of(holds, reading)
     windows = windows_of(window, len(tables) + len(held_tables))
     for table in tables:
