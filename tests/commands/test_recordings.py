@@ -16,7 +16,7 @@ from jaxmuscle.commands.options import PERTURBED, READING
 from jaxmuscle.commands.recordings import read_recordings, read_with_holds
 from jaxmuscle.data import _recording_files
 from jaxmuscle.data._as_target import as_target
-from jaxmuscle.data._perturbed import LEVER_ARM
+from jaxmuscle._common.units import LEVER_ARM
 from jaxmuscle.fits._perturbed import recordings_of
 
 RATE, LEVEL = 200, 40.5

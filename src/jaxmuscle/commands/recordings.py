@@ -81,8 +81,6 @@ def perturbed(reading: dict[str, Any]) -> bool:
 def moved_by_motor(paths: Sequence[str], reading: dict[str, Any]) -> bool:
     """Whether no column is named, and a file holds force and a displacement that moves; said if
     so."""
-    from jaxmuscle.data._recording_table import measured_in
-
     if reading["column"] is not None:
         return False
     for table in tables_of(paths, reading):
@@ -92,7 +90,7 @@ def moved_by_motor(paths: Sequence[str], reading: dict[str, Any]) -> bool:
             continue
         if not found or (moves := jm.data.movement(table, found["displacement"])).rests:
             continue
-        of_torque = measured_in(table, found["force"]) == "torque"
+        of_torque = table.measured_in(found["force"]) == "torque"
         if (moves.unit == "deg") != of_torque and reading["lever_arm"] is None:  # has a notice
             continue
         say_notice(
@@ -159,7 +157,7 @@ def read_with_holds(
 ) -> "tuple[list[PerturbedRecording], Trials]":
     """Records of a moved insertion and those of the same person with the insertion held, which have
     the force alone."""
-    from jaxmuscle.data._perturbed import LEVER_ARM
+    from jaxmuscle._common.units import LEVER_ARM
 
     tables, held_tables = tables_of(paths, reading), tables_of(holds, reading)
     windows = windows_of(window, len(tables) + len(held_tables))

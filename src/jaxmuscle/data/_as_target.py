@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxmuscle._common.errors import TargetError
+from jaxmuscle._common.units import LEVER_ARM
 
 from ._file_kinds import are_recordings, kind_of_file
 from ._frequency_response import JOINT, FrequencyResponse
 from ._frequency_response_files import load_frequency_response
-from ._perturbed import LEVER_ARM, PerturbedRecording
+from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._target import Target, load_target
 from ._trials import Trials, load_recordings

@@ -17,6 +17,7 @@ from jaxmuscle import plot
 from jaxmuscle._common.arguments import check_options, is_real, require
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.names import name_of_all
+from jaxmuscle._common.units import LEVER_ARM
 from jaxmuscle.spectra._cross_spectrum import LEAST_INPUT, Response, response_of
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -33,7 +34,6 @@ SIGN_FOUND = 4.0  # standard errors from which on the sign of the displacement i
 # Of the displacement, and of the angle of a joint: unit in texts, how many of it.
 SHOWN = {False: ("mm", 1e3), True: ("deg", float(np.degrees(1.0)))}
 MOVED = {"mm": (0.005, 100.0), "deg": (0.02, 30.0)}  # rms: what motors move
-LEVER_ARM = 0.05  # m, at which a joint in N m and rad is carried to the model's N and m
 # of the response: Hz, by default and at most; times the rate of the recording
 HIGHEST, MOST, BELOW = 30.0, 45.0, 0.4
 TURNED = (

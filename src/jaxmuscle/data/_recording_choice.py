@@ -15,7 +15,7 @@ from jaxmuscle._common.text import choices, printable
 
 from ._recording_outliers import OUTLIERS, find_outliers
 from ._recording_quality import Baseline, filled
-from ._recording_table import AXES, Table, bare, find, listed, measured_in, points, triple, values
+from ._recording_table import AXES, Table, bare, find, listed, points, triple, values
 from ._recording_time import Clock, Part, Sampling, clock, sampling
 from ._units import (
     SCALELESS,
@@ -279,7 +279,7 @@ def _chosen(table: Table, reading: Reading, time: str | None) -> _Choice:
         others = [name for name in others if name != beside]
     if len(others) == 1:
         return _Choice(others[0], others)
-    forces = [name for name in others if measured_in(table, name) in MEASURED["force"]]
+    forces = [name for name in others if table.measured_in(name) in MEASURED["force"]]
     if len(forces) != 1:
         called = forces or others
         forces = [name for name in called if FORCE.fullmatch(_NUMBER.sub("", bare(name)))]
@@ -304,7 +304,7 @@ def movement_of(table: Table, name: str) -> Movement:
     middle = samples[samples.size // 4 : samples.size - samples.size // 4]
     middle = middle[np.isfinite(middle)]
     size = float(np.std(middle)) if middle.size else math.nan
-    unit, measured = table.units.get(name, ""), measured_in(table, name)
+    unit, measured = table.units.get(name, ""), table.measured_in(name)
     if measured not in MEASURED["displacement"]:
         return Movement(size, unit, size == 0)
     scale, _ = scale_to_si(unit, "displacement_units", "displacement", 1.0)
@@ -316,7 +316,7 @@ def movement_of(table: Table, name: str) -> Movement:
 def _moved(table: Table, others: list[str], force: str) -> str:
     """What to say where a column is a displacement: the answer to a motor is no fluctuation of a
     hold."""
-    kinds = {name: measured_in(table, name) for name in others}
+    kinds = {name: table.measured_in(name) for name in others}
     moving = next((name for name in others if kinds[name] in MEASURED["displacement"]), None)
     if moving is None:
         return ""

@@ -44,6 +44,11 @@ class Table(NamedTuple):
     aliases: Mapping[str, str] = {}
     sheet: str = ""
 
+    def measured_in(self, name: str) -> str | None:
+        """What a column holds by its unit: force, torque, displacement, angle, ...; `None` for an
+        unknown one."""
+        return quantity_of(self.units.get(name, ""), name)
+
     @property
     def name(self) -> str:
         """What a recording of it is called: the file, and the sheet of several."""
@@ -145,12 +150,6 @@ def bare(name: str) -> str:
 def units_of(names: Iterable[str]) -> dict[str, str]:
     """The units that names of columns hold."""
     return {name: unit for name in names if (unit := name_and_unit(name)[1]) is not None}
-
-
-def measured_in(table: Table, name: str) -> str | None:
-    """What a column holds by its unit: force, torque, displacement, angle, ...; `None` for an
-    unknown one."""
-    return quantity_of(table.units.get(name, ""), name)
 
 
 def listed(names: Iterable[str]) -> str:

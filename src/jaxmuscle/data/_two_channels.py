@@ -19,7 +19,7 @@ from ._recording_choice import (
     signals,
 )
 from ._recording_files import read_table, read_tables
-from ._recording_table import Table, bare, find, listed, measured_in
+from ._recording_table import Table, bare, find, listed
 
 CALLED = {
     "force": FORCE,
@@ -83,7 +83,7 @@ def _found_in(
     others, found = signals(table, time), dict[str, list[str]]()
     for role, given in (("force", force), ("displacement", displacement)):
         named = [name for name in others if CALLED[role].fullmatch(bare(name))]
-        meant = [name for name in others if measured_in(table, name) in MEASURED[role]]
+        meant = [name for name in others if table.measured_in(name) in MEASURED[role]]
         found[role] = (
             [find(table, given, role)]
             if given is not None

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from jaxmuscle._common.arguments import require
 from jaxmuscle._common.arrays import as_numbers, with_nulls
 from jaxmuscle._common.keys import key_of
+from jaxmuscle._common.units import LEVER_ARM
 from jaxmuscle.data._frequency_response import FrequencyResponse, check_seen
-from jaxmuscle.data._perturbed import LEVER_ARM
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._parameters import (
