@@ -11,12 +11,12 @@ import pytest
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
+from jaxmuscle._common.units import LEVER_ARM
 from jaxmuscle.commands.main import app
 from jaxmuscle.commands.options import PERTURBED, READING
 from jaxmuscle.commands.recordings import read_recordings, read_with_holds
 from jaxmuscle.data import _recording_files
 from jaxmuscle.data._as_target import as_target
-from jaxmuscle._common.units import LEVER_ARM
 from jaxmuscle.fits._perturbed import recordings_of
 
 RATE, LEVEL = 200, 40.5
