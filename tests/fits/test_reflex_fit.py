@@ -71,12 +71,12 @@ def test_it_is_fitted_where_that_is_asked_for():
 def test_what_cannot_be_told_is_said():
     nothing = np.zeros(len(DELAYS))
     shifts = {"K_z0": (0.4, 2.5), "K_w_tangent": (0.01, 0.2)}
-    unsure = ReflexTest(0.31, nothing, nothing, 12.3, shifts)
+    unsure = ReflexTest(0.31, nothing, 12.3, shifts)
     assert not unsure.seen
     assert unsure.notice.startswith("muscle and stretch reflex cannot be told apart in these data.")
     assert "would change K_z0 by 40 %, more than the stated errors" in unsure.notice
     assert "K_w_tangent" not in unsure.notice and "20 or 30 Hz" in unsure.notice
-    sure = ReflexTest(0.31, nothing, nothing, 12.3, {"K_z0": (0.01, 0.3)})
+    sure = ReflexTest(0.31, nothing, 12.3, {"K_z0": (0.01, 0.3)})
     assert sure.notice == (
         "no stretch reflex is seen (p = 0.31). One of 12 N s/m would have been seen"
     )

@@ -35,14 +35,13 @@ WIDER = "What would tell: a motion that has power up to 20 or 30 Hz, or a larger
 
 class ReflexTest(NamedTuple):
     """`p`, how often data without a reflex look as much like one; the `gain` [N s/m] that fits best
-    at each of `DELAYS`, and the `score` there, in standard errors; `least`, the gain of which nine
-    of ten are seen; `shifts` {quantity: how far it is off if that is left out, over its value and
-    over its error}; `fitted`, whether a reflex that is seen describes the response better.
+    at each of `DELAYS`; `least`, the gain of which nine of ten are seen; `shifts` {quantity: how
+    far it is off if that is left out, over its value and over its error}; `fitted`, whether a
+    reflex that is seen describes the response better.
     """
 
     p: float
     gain: Float[np.ndarray, " delays"]
-    score: Float[np.ndarray, " delays"]
     least: float
     shifts: dict[str, tuple[float, float]]
     fitted: bool = True
@@ -77,9 +76,9 @@ def look_for_reflex(ended: Endpoint) -> ReflexTest | None:
     """A score test for a linear velocity reflex beside the fitted muscle; None without a response.
 
     A reflex of gain g, delay d and time T changes the residuals of the dynamic stiffness by g u, u
-    = G_P R / sd. A refit leaves (1 - H) u of that, to first order. With c = (1 - H) u and the
-    fitted residuals r the score is -c·r over its standard deviation in replicates of data without a
-    reflex, each refitted; p is that of the largest score among `DELAYS`.
+    = G_P R / (g sd). A refit leaves c of u, to first order. With the fitted residuals r the score
+    is -c·r over its standard deviation in replicates of data without a reflex, each refitted; p is
+    that of the largest score among `DELAYS`.
     """
     problem, objective, found = ended.problem, ended.objective, ended.found
     which = [i for i, part in enumerate(problem.parts) if part.points is not None]
@@ -95,13 +94,12 @@ def look_for_reflex(ended: Endpoint) -> ReflexTest | None:
     null = refitted_residuals(ended, generator_of(problem, 8)) @ left.T
     spread = null.std(axis=0)
     here = -(np.concatenate([found.residuals, ended.refit.prior]) @ left.T)
-    score, top = here / spread, np.max(null / spread, axis=1)
-    p = (1 + np.sum(top >= score.max())) / (1 + REPLICATES)
+    top = np.max(null / spread, axis=1)
+    p = (1 + np.sum(top >= np.max(here / spread))) / (1 + REPLICATES)
     usual = int(np.argmin(np.abs(DELAYS - USUAL)))
     least = (np.quantile(top, 1 - SEEN) + POWER) * spread[usual] / size[usual]
-    return ReflexTest(
-        float(p), here / size, score, float(least), _shifts(ended, i, least * columns[usual])
-    )
+    shifts = _shifts(ended, i, least * columns[usual])
+    return ReflexTest(float(p), here / size, float(least), shifts)
 
 
 def _responses(ended: Endpoint, i: int) -> np.ndarray:
@@ -127,12 +125,10 @@ def _shifts(ended: Endpoint, i: int, column: np.ndarray) -> dict[str, tuple[floa
     for name in STATED:
         if name in ended.found.slopes[i]:
             slope = np.asarray(ended.found.slopes[i][name])
-            value, error = (
-                float(ended.found.values[i][name]),
-                np.sqrt(slope @ ended.covariance @ slope),
-            )
+            value = abs(float(ended.found.values[i][name]))
+            error = float(np.sqrt(slope @ ended.covariance @ slope))
             off = abs(float(slope @ moved))
-            found[name] = (off / abs(value), off / float(error))
+            found[name] = (off / value, off / error)
     return found
 
 

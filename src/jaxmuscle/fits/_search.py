@@ -25,12 +25,7 @@ from jaxmuscle.objective._consequences import BATCH
 from jaxmuscle.objective._least_squares import Minima, least_squares
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.objective._residuals import Residuals
-from jaxmuscle.objective._starts import (
-    contenders,
-    kinds_of_starts,
-    recombined,
-    starting_points,
-)
+from jaxmuscle.objective._starts import contenders, kinds_of_starts, recombined, starting_points
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
@@ -141,39 +136,40 @@ class _Search:
     def look_for_reflex(self, models: Models) -> None:
         """Test the best model for a reflex that it lacks, and go on with one that is seen; of
         recordings a second time, with the target that muscle and reflex see."""
-        found = self.best
-        test = None if found is None else look_for_reflex(found.ended)
-        if found is None or test is None or models.with_reflex is None:
+        without = self.best
+        if without is None or models.with_reflex is None:
             return
-        self.reflex = test
-        if not test.seen and models.reflex != "linear":
+        test = self.reflex = look_for_reflex(without.ended)
+        if test is None or not (test.seen or models.reflex == "linear"):
             return
-        muscle, number = None, found.rung.number
-        for _ in range(1 + (models.renewed is not None)):
-            plan = models.with_reflex(number, muscle)
-            known = dict(zip(self.plan.problem.coordinates.names, self._values(), strict=True))
-            points, kinds = starts_with_reflex(plan.problem, known, test)
-            stages: list[Stage] = []
-            plan = plan._replace(kinds=kinds)
-            reached = _descended(plan, points, stages)
-            if reached is None:
-                return
-            ended = Endpoint.of(plan.problem, stages[-1])
-            rung = rung_of(ended, number)
-            name = f"{rung.model} + {REFLEX}"
-            rung = msgspec.structs.replace(rung, model=name, chosen=True)
-            if models.reflex == "auto" and rung.aic > found.rung.aic - REFLEX_MARGIN:
-                self.reflex = test._replace(fitted=False)
-                return
-            self.keep(Climbed(plan, stages, reached, ended, rung))
-            muscle = _reached(plan, stages)[0]
-        without = [msgspec.structs.replace(r, chosen=False) for r in self.ladder]
-        self.ladder = (*without, self.best.rung) if self.best is not None else self.ladder
+        found = self._with_reflex(models.with_reflex(without.rung.number, None), without, test)
+        if found is None:
+            return
+        # the AIC of two models of one target; that of the second turn is another one
+        if models.reflex == "auto" and found.rung.aic > without.rung.aic - REFLEX_MARGIN:
+            self.reflex = test._replace(fitted=False)
+            return
+        self.keep(found)
+        if models.renewed is not None:
+            seen_by = _reached(self.plan, self.stages)[0]
+            again = models.with_reflex(without.rung.number, seen_by)
+            found = self._with_reflex(again, found, test) or found
+            self.keep(found)
+        others = [msgspec.structs.replace(rung, chosen=False) for rung in self.ladder]
+        self.ladder = (*others, found.rung)
 
-    def _values(self) -> list[float]:
-        """The free parameters of the best point."""
-        c, found = self.plan.problem.coordinates, self.stages[-1].minima
-        return c.values_of(np.asarray(c.theta(found.s[found.best]))[None])[0].tolist()
+    def _with_reflex(self, plan: Plan, best: Climbed, test: ReflexTest) -> Climbed | None:
+        """A model with a reflex, fitted from where another one ended; None where no search ends."""
+        there = best.ended.values_of(best.plan.problem.coordinates.names)
+        points, kinds = starts_with_reflex(plan.problem, there, test)
+        plan, stages = plan._replace(kinds=kinds), list[Stage]()
+        known = _descended(plan, points, stages)
+        if known is None:
+            return None
+        ended = Endpoint.of(plan.problem, stages[-1])
+        rung = rung_of(ended, best.rung.number)
+        rung = msgspec.structs.replace(rung, model=f"{rung.model} + {REFLEX}", chosen=True)
+        return Climbed(plan, stages, known, ended, rung)
 
 
 def search(

@@ -74,7 +74,7 @@ class Endpoint:
         """Free parameters and derived quantities."""
         tables = self.problem.by_name(self.found.values)
         free = self.problem.coordinates.names
-        natural = self.problem.coordinates.values_of(self.seen.theta)
+        natural = self.problem.coordinates.values_of(self.seen.theta[None])[0]
         known = dict(zip(free, natural, strict=True))
         # of several targets, a quantity that is the same for all is that of the first
         first = f"@{self.problem.parts[0].name}"

@@ -187,16 +187,19 @@ def heading(fig: AnyFigure, words: str, *, bad: str = "") -> int:
 
 
 def key(fig: AnyFigure, columns: int = 2, *, plain: bool = False) -> int:
-    """One legend below all panels that have none, in which each name stands once; how many lines.
+    """One legend below all panels, in which each name stands once that no panel's own legend has;
+    how many lines.
 
     It has fewer columns than asked where it would be wider than the figure. `plain`, of names that
     somebody else gave, in which $ is no sign of mathematics.
     """
+    own = [legend.get_texts() for ax in fig.axes if (legend := ax.get_legend()) is not None]
+    said = {text.get_text() for texts in own for text in texts}
     named = {
         label: handle
         for ax in fig.axes
-        if ax.get_legend() is None
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+        if label not in said
     }
     if not named:
         return 0
