@@ -3,10 +3,10 @@ docs/perturbed.md.
 
     python benchmarks/perturbed.py PART [--count N]
 
-PART: classical, amplitude, reflex, inertia, active, reference, people, rhythm, richer, linear,
-seconds, limb, coverage or time.
+PART: classical, amplitude, reflex, ankle, cascade, inertia, active, reference, people, rhythm,
+richer, linear, seconds, limb, coverage or time.
 
-Takes a minute to a quarter of an hour each.
+Takes a minute to a quarter of an hour each, ankle some 40 s for each recording.
 """
 
 import argparse
@@ -20,10 +20,11 @@ import scipy.integrate
 import scipy.interpolate
 import scipy.optimize
 from measure import seconds as timed
-from perturbed_muscle import DT, Sines, force, recorded
+from perturbed_muscle import DT, MARGIN, Sines, force, recorded
 
 import jaxmuscle as jm
 from jaxmuscle.fits import _search
+from jaxmuscle.model._parameters import REFLEX
 from jaxmuscle.objective._derived import GAINS, LIMB, PHASES, TISSUES
 
 TASK = jm.PrescribedLength()
@@ -542,24 +543,188 @@ def limb(count: int) -> None:
     """What is stated of a moved limb: bias over the stated error, and intervals that hold."""
     for words, task in (("default muscle, 2.2 N", TASK), ("strong muscle, 36 N", STRONG)):
         print(words)
-        _stated(
-            [
-                jm.fit(TASK, run, **QUICK)
-                for run in recorded(task, np.random.default_rng(36), count)
-            ],
-            task,
-        )
+        runs = recorded(task, np.random.default_rng(36), count)
+        fits = [jm.fit(TASK, run, **QUICK) for run in runs]
+        _stated(fits, series(task), lambda f, task=task: answer(task, f))
 
 
-def _stated(fits: list[jm.fits.FitResult], task: jm.PrescribedLength) -> None:
+# Two tissues about the axis of a joint (N m/rad, N m s/rad, kg m²), and a reflex (s)
+ANKLE = {"K_w": 200.0, "K_z": 400.0, "C_w": 6.0, "C_z": 1.0, "m_w": 0.01, "m_z": 0.02}
+LATE, TWITCH = 0.04, 0.05
+
+
+def ankle_parts(f: Any) -> tuple[Any, Any, Any]:
+    """Dynamic stiffness of the ankle's tissues [N m/rad] at frequencies [Hz], what a reflex of 1 N
+    m s/rad adds to it, and how much of a torque on its active tissue the sensor reads."""
+    s = 2j * np.pi * f
+    passive = ANKLE["K_z"] + ANKLE["C_z"] * s
+    through = passive / (ANKLE["m_w"] * s**2 + ANKLE["C_w"] * s + ANKLE["K_w"] + passive)
+    late = s * np.exp(-s * LATE) / (1 + s * TWITCH) ** 2
+    return ANKLE["m_z"] * s**2 + passive - passive * through, through * late, through
+
+
+def ankle_record(
+    rng: np.random.Generator, gain: float, high: float = 30.0, *, one_way: bool = False
+) -> jm.data.PerturbedRecording:
+    """A minute of the ankle that is moved evenly from 0.5 Hz to `high`, 16 mrad rms, with a reflex
+    to its velocity, or to lengthening alone. Its torque of 10 N m fluctuates by a noise through a
+    twitch on the active tissue, and one on the passive."""
+    rate, seconds = 500.0, 60.0
+    n = round((seconds + 2 * MARGIN) * rate)
+    f = np.fft.rfftfreq(n, 1 / rate)
+    moved = np.fft.rfft(rng.standard_normal(n)) * ((f >= 0.5) & (f <= high))
+    moved *= 0.016 / np.std(np.fft.irfft(moved, n))
+    tissues, reflex, through = ankle_parts(f)
+    white = np.fft.rfft(rng.standard_normal((2, n))) * np.sqrt(rate / 2) / (1 + (f / 50) ** 4)
+    own = through * white[0] / (1 + 2j * np.pi * f * TWITCH) ** 2 + 0.05 * (1 - through) * white[1]
+    felt = moved
+    if one_way:
+        speed = np.fft.irfft(2j * np.pi * f * moved, n)
+        felt = np.fft.rfft(np.maximum(speed, 0.0)) / np.where(f > 0, 2j * np.pi * f, np.inf)
+    return jm.data.PerturbedRecording.from_array(
+        10.0 + np.fft.irfft(tissues * moved + gain * reflex * felt + own, n),
+        np.fft.irfft(moved, n),
+        rate,
+        positive="lengthening",
+        units="N m",
+        displacement_units="rad",
+        window=(MARGIN, MARGIN + seconds),
+    )
+
+
+CASES = ((0.0, 30.0), (2.0, 30.0), (6.0, 30.0), (20.0, 30.0), (6.0, 5.0))
+
+
+def ankle(count: int) -> None:
+    """Muscle and reflex of an ankle, by the gain of the reflex [N m s/rad]: found or not, and
+    intervals that hold. The last one is moved to 5 Hz only."""
+    for gain, high in CASES:
+        print(f"reflex {gain:g} N m s/rad, motion to {high:g} Hz")
+        _ankles([ankle_fit(gain, high, seed) for seed in range(count)], gain)
+
+
+def ankle_seed(gain: float, high: float, seed: int) -> np.random.Generator:
+    """Of one of the records."""
+    return np.random.default_rng([seed, int(gain), int(high)])
+
+
+def ankle_fit(gain: float, high: float, seed: int) -> jm.fits.FitResult:
+    """The fit of one of the records."""
+    record = ankle_record(ankle_seed(gain, high, seed), gain, high)
+    return jm.fit(TASK, record, seeds=0, check_seeds=0)
+
+
+def cascade(count: int) -> None:
+    """The parallel-cascade method and the fit, on ankles whose reflex answers lengthening alone:
+    stiffness of the tissues when pulled slowly [N m/rad], and gain of the reflex at the sensor [N m
+    s/rad], which is two thirds of its own."""
+    through = ANKLE["K_z"] / (ANKLE["K_w"] + ANKLE["K_z"])
+    for gain in (0.0, 2.0, 6.0, 20.0):
+        records = [
+            ankle_record(ankle_seed(gain, 30.0, seed), gain, one_way=True) for seed in range(count)
+        ]
+        print(f"reflex {gain:g} N m s/rad to lengthening alone")
+        stiff, felt = np.transpose([parallel_cascade(record) for record in records]).tolist()
+        spread("  parallel cascade, stiffness", stiff, [], ANKLE["K_w"] * through)
+        spread("  parallel cascade, reflex", felt, [], gain * through)
+        fits = [jm.fit(TASK, record, seeds=0, check_seeds=0) for record in records]
+        limb = [fit["tangent_stiffness"] for fit in fits]
+        scale = fits[0].target.stiffness.lever_arm ** 2
+        errors = [scale * p.stderr for p in limb if p.stderr is not None]
+        found = [scale * p.value for p in limb]
+        spread("  fit, stiffness", found, errors, ANKLE["K_w"] * through)
+        # one of twice the gain that answers lengthening alone is the linear one and what is beside
+        felt = [
+            2 * scale * fit["reflex_gain"].value * _through(fit)
+            for fit in fits
+            if "reflex_gain" in fit.parameters
+        ]
+        print(f"  a reflex is fitted in {len(felt)} of {count}")
+        if len(felt) > 1:
+            spread("  fit, reflex", felt, [], gain * through)
+
+
+def _through(fit: jm.fits.FitResult) -> float:
+    K_w, K_z = fit["K_w_tangent"].value, fit["K_z0"].value
+    return K_z / (K_w + K_z)
+
+
+def parallel_cascade(record: jm.data.PerturbedRecording) -> tuple[float, float]:
+    """The method of Kearney, Stein & Parameswaran 1997 at 100 Hz: in turn a linear filter of the
+    angle at lags within the delay of the reflex, and one of the positive part of the velocity at
+    longer ones, each of what the other leaves, until that explains hardly more."""
+    angle, rate = record.displacement.whole, record.rate
+    f = np.fft.rfftfreq(angle.size, 1 / rate)
+    speed = np.fft.irfft(2j * np.pi * f * np.fft.rfft(angle), angle.size)
+    moved, felt, torque = (
+        scipy.signal.decimate(x, round(rate / 100), ftype="fir")
+        for x in (angle, np.maximum(speed, 0.0), record.force.whole)
+    )
+    late, inside = round(LATE * 100), slice(round(MARGIN * 100), -round(MARGIN * 100))
+    lags = np.arange(-late, late), np.arange(late, 50)
+    paths = [
+        np.stack([np.roll(x, k)[inside] for k in own], axis=1)
+        for x, own in zip((moved, felt), lags, strict=True)
+    ]
+    paths = [path - path.mean(axis=0) for path in paths]
+    left = torque[inside] - torque[inside].mean()
+    filters, before = [np.zeros(len(own)) for own in lags], np.inf
+    while np.var(left) < (1 - 1e-6) * before:
+        before = np.var(left)
+        for i, path in enumerate(paths):
+            more, *_ = np.linalg.lstsq(path, left)
+            filters[i] += more
+            left = left - path @ more
+    return float(filters[0].sum()), float(filters[1].sum())
+
+
+def _ankles(fits: list[jm.fits.FitResult], gain: float) -> None:
+    response = fits[0].target.stiffness
+    assert response is not None and response.lever_arm is not None
+    scale = response.lever_arm**-2
+    T, K_z = ANKLE["K_w"], ANKLE["K_z"]
+    true = {
+        "tangent_stiffness": T * K_z / (T + K_z),
+        "B0": (ANKLE["C_z"] * T**2 + ANKLE["C_w"] * K_z**2) / (T + K_z) ** 2,
+        "m_z": ANKLE["m_z"],
+        "K_w_tangent": T,
+        "K_z0": K_z,
+        "C_w0": ANKLE["C_w"],
+        "C_z0": ANKLE["C_z"],
+        "reflex_gain": gain,
+    }
+    true = {name: scale * value for name, value in true.items()}
+    true |= {"reflex_delay": LATE, "reflex_time": TWITCH}
+    seen = [fit for fit in fits if "reflex_gain" in fit.parameters]
+    words = [note for fit in fits for note in fit.notices if "cannot be told apart" in note]
+    print(
+        f"  a reflex is fitted in {len(seen)} of {len(fits)}; cannot be told apart: {len(words)};"
+        f" described: {sum(bool(fit.adequate) for fit in fits)}"
+    )
+    shares = [list(fit.only.explained.values())[2:] for fit in fits]
+    print(
+        f"  explained, medians: {np.median([one[0] for one in shares]):.3f} together, the other"
+        f" half {np.median([one[-1] for one in shares]):.3f}"
+    )
+
+    def answered(f: float) -> complex:
+        tissues, reflex, _ = ankle_parts(f)
+        return scale * (tissues + gain * reflex)
+
+    _stated(fits, true, answered)
+
+
+def _stated(
+    fits: list[jm.fits.FitResult], true: dict[str, float], answer: Callable[[float], complex]
+) -> None:
     rows: dict[str, list[tuple[float, Any]]] = {}
     for fit in fits:
-        true = series(task)
         for gain, phase, f in zip(GAINS, PHASES, fit.only.thirds, strict=True):
-            H = answer(task, f)
-            true |= {gain: abs(H), phase: np.degrees(np.angle(H))}
-        for name in (*LIMB, *TISSUES):
-            rows.setdefault(name, []).append((true[name], fit[name]))
+            H = answer(f)
+            true = true | {gain: abs(H), phase: np.degrees(np.angle(H))}
+        for name in (*LIMB, *TISSUES, *REFLEX):
+            if name in fit.parameters or name in fit.derived:
+                rows.setdefault(name, []).append((true[name], fit[name]))
     for name, found in rows.items():
         stated = [(p.value - t, p.stderr) for t, p in found if p.stderr is not None]
         off, error = np.mean(stated, axis=0) if stated else (np.nan, np.nan)
@@ -637,6 +802,8 @@ PARTS: dict[str, Callable[[int], None]] = {
         classical,
         amplitude,
         reflex,
+        ankle,
+        cascade,
         inertia,
         active,
         reference,

@@ -6,6 +6,7 @@ import re
 
 import jax
 import matplotlib.pyplot as plt
+import msgspec
 import numpy as np
 import pytest
 import scipy.signal
@@ -171,6 +172,26 @@ def test_what_a_fit_says_and_keeps(result, tmp_path):
     np.testing.assert_array_equal(again.only.stiffness, result.only.stiffness)
     np.testing.assert_array_equal(again.target.stiffness.value, result.target.stiffness.value)
     assert len(result.ladder) == 1 and result.ladder[0].model == "slow part alone"
+
+
+def test_it_is_said_how_much_of_the_force_is_explained(result):
+    """Where the model misses, too; and its numbers are told if it foretells most of the other
+    half."""
+    shares = result.only.explained
+    assert "reflex" not in shares and shares["low"] < 0.5 and 5.0 < shares["high"] < 10.0
+    assert shares["other_half"] == pytest.approx(shares["together"], abs=0.02)
+    said = f"explains {100 * shares['together']:.1f} % of the variance of the force"
+    assert said in str(result) and "in the half that is not fitted" in " ".join(str(result).split())
+    missed = msgspec.structs.replace(result.adequacy, p=0.001, misfit="the data have more")
+    (name,) = result.parts
+    for share, told in ((0.81, True), (0.79, False)):
+        part = dataclasses.replace(result.only, explained=shares | {"other_half": share})
+        words = str(dataclasses.replace(result, adequacy=missed, parts={name: part}))
+        measured, _, model = words.partition("MODEL")
+        assert measured.count(" deg") == 3 and said in model
+        assert ("B0, damping" in model) is told
+        assert ("Report only what is measured" in model) is not told
+        assert "K_z0" not in words
 
 
 @pytest.mark.slow
@@ -634,9 +655,10 @@ def test_the_numbers_of_a_joint_do_not_depend_on_the_lever_arm():
                 n: (square * result[n].value, square * (result[n].stderr or np.inf))
                 for n in ("K_w_tangent", "K_z0", "tangent_stiffness", "C_z0", "m_z")
             }
-            words = str(result)
-            assert f"About the axis of the joint (those in N and m are at {arm or 0.05} m" in words
-            assert "N m/rad" in words and "kg m²" in words
+            words, more = str(result), result.details()
+            assert "N m/rad" in words and "kg m²" in words and "N/m" not in words
+            assert f"about the axis of the joint (those in N and m are at {arm or 0.05} m" in more
+            assert "N m/rad" in more and "N/m" in more
     true = {
         "K_w_tangent": 120.0,
         "K_z0": 90.0,

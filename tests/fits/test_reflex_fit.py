@@ -1,12 +1,16 @@
 """A stretch reflex in a fitted response: of an ankle that NumPy made."""
 
 import functools
+import re
 
 import numpy as np
 import pytest
 
 import jaxmuscle as jm
-from jaxmuscle.fits._reflex import DELAYS, ReflexTest
+from jaxmuscle.data._perturbed import explained_power
+from jaxmuscle.fits._perturbed import answer_of, explained, seen_with
+from jaxmuscle.fits._reflex import DELAYS, ReflexTest, planned_with_reflex
+from jaxmuscle.objective._options import FitOptions
 
 F = np.geomspace(0.5, 30.0, 45)
 ARM = 0.05  # m
@@ -80,6 +84,86 @@ def test_what_cannot_be_told_is_said():
     assert sure.notice == (
         "no stretch reflex is seen (p = 0.31). One of 12 N s/m would have been seen"
     )
+
+
+RATE, SECONDS = 1000, 68
+
+
+def moved(gain, one_way, seed=3):
+    """A minute and margins of the ankle moved to 25 Hz, 16 mrad rms, and the share of the variance
+    of its force from 0.5 to 25 Hz that is the answer; with a reflex that answers lengthening alone,
+    if it is `one_way`."""
+    generator, n = np.random.default_rng(seed), RATE * SECONDS
+    f = np.fft.rfftfreq(n, 1 / RATE)
+    inside = (f >= 0.5) & (f <= 25)
+    X = np.fft.rfft(generator.standard_normal(n)) * inside
+    X *= 0.016 / np.std(np.fft.irfft(X, n))
+    s = 2j * np.pi * f
+    answer = ankle(f, 0.0) * X
+    speed = np.fft.irfft(s * X, n)
+    felt = np.fft.rfft(np.maximum(speed, 0.0) if one_way else speed)
+    twitch = (ankle(f, gain) - ankle(f, 0.0))[1:] / s[1:] * felt[1:]
+    answer += np.append(0.0, twitch)
+    own = np.fft.rfft(generator.standard_normal(n)) * 60 / (1 + 1j * f / 2)
+    share = 1 - np.sum(np.abs(own[inside]) ** 2) / np.sum(np.abs((answer + own)[inside]) ** 2)
+    pull, arm = 200.0 + ARM * np.fft.irfft(answer + own, n), ARM
+    given = jm.data.PerturbedRecording.from_array(
+        pull, arm * np.fft.irfft(X, n), RATE, positive="lengthening", window=(4.0, 64.0)
+    )
+    return given, share
+
+
+def muscle(gain):
+    """The same as a task. Its stiffness is that of the ankle where P_w is 0."""
+    values = {"m_w": 0.01, "m_z": 0.02, "c_w": 6.0, "c_z": 1.0}
+    task = jm.PrescribedLength(**{name: value / ARM**2 for name, value in values.items()})
+    stiff = {f"k_{j}": STIFF[name] / 4e-4 for j, name in (("w", "K_w_tangent"), ("z", "K_z0"))}
+    reflex = jm.model.Reflex(gain / ARM**2, 0.04, 0.05) if gain else None
+    return task.replace(P_w=0.0, **stiff).with_parts(reflex=reflex)
+
+
+@pytest.mark.parametrize("one_way", [True, False])
+def test_a_reflex_to_lengthening_alone_is_seen_and_taken_off(one_way, x64):
+    """Of one to lengthening alone the linear part has half of the gain."""
+    given, share = moved(20.0, one_way)
+    task = muscle(10.0 if one_way else 20.0)
+    target = seen_with(task, (given,))
+    said = [notice for notice in target.notices if notice.startswith("the reflex answers")]
+    power, whole = explained_power((given,), answer_of(task), (0.5, 25.0))
+    assert power / whole == pytest.approx(share, abs=0.004)
+    if not one_way:
+        assert not said
+        return
+    (words,) = said
+    percent, error = (float(x) for x in re.findall(r"(\d+) ± (\d+) %", words)[0])
+    assert abs(percent - 100) < 3 * max(error, 1.0) < 20
+    linear, _ = explained_power((given,), answer_of(task)._replace(beside=None), (0.5, 25.0))
+    assert linear / whole < share - 0.02
+
+
+def test_the_shares_of_tissues_and_reflex_and_that_of_the_other_half(x64):
+    """Of the answer as it was made; of one half, fitted from far off, that of the other."""
+    given, share = moved(20.0, one_way=False)
+    windows = []
+
+    def planned_for(target, some):
+        windows.extend(one.window for one in some)
+        task = muscle(0.0).replace(c_w=4000.0, c_z=300.0)
+        options = FitOptions(free=("k_w", "k_z", "c_w", "c_z", "m_z"))
+        return planned_with_reflex(
+            task, jm.Target("half", None, stiffness=target.stiffness), options
+        )
+
+    found = explained(muscle(20.0), (given,), (0.5, 25.0), planned_for, 60)
+    assert windows == [(4.0, 34.0), (34.0, 64.0)]
+    assert (found["low"], found["high"]) == (0.5, 25.0)
+    assert found["together"] == pytest.approx(share, abs=0.004)
+    assert found["tissues"] + found["reflex"] == pytest.approx(found["together"])
+    assert found["reflex"] > 0.02
+    assert found["together"] - 0.02 < found["other_half"] < found["together"] + 0.005
+    # a minute that is too short for halves has the other shares
+    short = given.steady((4.0, 18.0))
+    assert "other_half" not in explained(muscle(20.0), (short,), (0.5, 25.0), planned_for, 60)
 
 
 def test_what_is_asked_for_must_be_known():

@@ -90,6 +90,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
             "largest_deviation_sd": 0.01,
         },
         "further": {"coefficient_of_variation": -1.5},
+        "explained": {},
         "stiffness": None,
         "notices": ("a notice",),
         "unstated": ("why a number is not stated",),

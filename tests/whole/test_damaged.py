@@ -9,7 +9,7 @@ from test_result import made_result
 
 COUNT = 250  # of every format; `python tests/damage.py --count 5000` tries more
 # tables whose keys are free
-FREE = {"components", "check", "further", "derived", "measured", "bounds", "versions"}
+FREE = {"components", "check", "further", "explained", "derived", "measured", "bounds", "versions"}
 NAMES = (
     "fit.json",
     "preset.toml",

@@ -67,8 +67,14 @@ LINEAR = (
     " could not be computed. If the motion was large, a part of it is left in the fluctuations"
 )
 # Of the share of the nonlinear response that is there: standard errors from 1 from which on it is
-# told, standard errors from 0 within which none is seen; a difference from 1 that gets a notice.
-FROM_ALL, FROM_NONE, DIFFERENT = 4.0, 2.0, 0.2
+# that which is seen, standard errors from 0 within which none is seen. A notice comes from so many
+# standard errors and such a difference from 1 on; of a reflex, so many standard errors from 0.
+FROM_ALL, FROM_NONE, SURELY, DIFFERENT = 2.5, 2.0, 4.0, 0.2
+ONE_WAY = (
+    "the reflex answers lengthening more than shortening: {:.0f} ± {:.0f} % of what one to"
+    " lengthening alone does beside its linear part ({:.2g} N rms) is in the force. That is taken"
+    " off, too"
+)
 UNLIKE = (
     "the force answers the movement {} nonlinearly than the muscle of the model. The nonlinear part"
     " of the model's answer is {:.2g} N rms; the recording shows {:.0f} ± {:.0f} % of it. The fit"
@@ -82,8 +88,7 @@ Kept = Float[np.ndarray, " kept"]
 Frequencies = Float[np.ndarray, " frequencies"]
 Ordinates = Complex[np.ndarray, " frequencies"]
 Stiffness = Callable[[Frequencies], Ordinates]
-Motion = Float[np.ndarray, "3 times"]
-Reply = Float[np.ndarray, " steps"]
+Motion = Float[np.ndarray, "3 steps"]
 
 
 class _Options(About, total=False):
@@ -509,7 +514,8 @@ class PerturbedRecording(Shown, eqx.Module):
         **Raises:** `ValueError` if the window, without the first and the last 2 s of the recording,
         is shorter than 8 s.
         """
-        return perturbed_target((self,), stiffness, name, settings=settings, provenance=provenance)
+        answer = None if stiffness is None else Answer(stiffness)
+        return perturbed_target((self,), answer, name, settings=settings, provenance=provenance)
 
     def plot(self, settings: SpectrumSettings | str | None = None, ax: Any = None) -> Any:
         """Draw both channels with the window, and gain, phase and coherence with their errors;
@@ -600,6 +606,21 @@ def _sign(
     return 1.0, []
 
 
+class Answer(NamedTuple):
+    """How the force answers the lengthening l: linearly, h * l by the `stiffness` H(f) [N/m] of a
+    vector of frequencies, and `beside` that.
+
+    `beside`, at the samples [N]: a function of l, its velocity and acceleration [m, m/s, m/s²] at
+    `HALF_STEPS` times a sample, so far apart [s], and of h * l [N]; not used where it is not
+    finite. `one_way`, whether it is what a reflex to lengthening alone does beside its linear part,
+    else it is what a nonlinear muscle does.
+    """
+
+    stiffness: Stiffness
+    beside: Callable[[Motion, float, Times], Times] | None = None
+    one_way: bool = False
+
+
 class _Moved(NamedTuple):
     """One recording at the rate of the settings: force, lengthening about its mean in the window,
     and what the force does when it follows that: linearly, and by how much differently in the
@@ -625,10 +646,9 @@ class _Moved(NamedTuple):
 
 def perturbed_target(
     recordings: Sequence[PerturbedRecording],
-    stiffness: Stiffness | None = None,
+    answer: Answer | None = None,
     name: str | None = None,
     *,
-    predicted: Callable[[Motion, float], Reply] | None = None,
     settings: SpectrumSettings | str | None = None,
     provenance: str = "measured",
 ) -> Target:
@@ -637,7 +657,7 @@ def perturbed_target(
 
     With the lengthening l, its response `h * l` by the `stiffness` H and the transform X_j = Σ_m
     w_m x_m e^(-2πi f_j m Δ) of a whole window (w a cosine taper over its first and last 5 %), the
-    rest e = F - h * l gives
+    rest e = F - h * l - β q gives
 
         Ĥ_g = H(f_g) + Σ_j w_j L_j* E_j / Σ_j w_j |L_j|²
         sd² = 1 / (2 Σ_j w_j |L_j|²)   (of each part)
@@ -646,60 +666,96 @@ def perturbed_target(
     frequency, so weighted; real and imaginary part of Ĥ have the same sd. The response is computed
     through the whole recording, so neither window nor leakage of the input biases Ĥ; where H is the
     muscle's own, e is its fluctuation alone. Its spectrum, mean and coefficient of variation are
-    the target's. S_E is the measured density of e. q is what the response of the nonlinear muscle
-    (`predicted`) differs by from h * l, and β = 1, unless the recordings show another share of q
-    (`_share_shown`).
+    the target's. S_E is the measured density of e. q is what the answer has beside h * l, and β
+    the share of q that the recordings show (`_share_shown`).
 
     **Arguments:**
 
     - `recordings` with their windows
-    - `stiffness` H(f) [N/m] of a vector of frequencies, by default the nonparametric one
-      (`PerturbedRecording.frequency_response`)
-    - `predicted`: which gives the response of the force [N] to lengthening, its velocity and
-      acceleration (at times so far apart [s], every second of which is asked for), by the nonlinear
-      muscle say, instead of H, which stays where that is not finite; others as in
-      `Recording.target`
+    - `answer`, by default the nonparametric response (`PerturbedRecording.frequency_response`)
+    - others as in `Recording.target`
     """
-    settings = recorded_settings(settings)
-    recordings = [one.at_lever_arm(LEVER_ARM) if one.of_joint else one for one in recordings]
+    settings, recordings = recorded_settings(settings), _in_newtons(recordings)
     first = recordings[0]
     for one in recordings[1:]:
         remedy = f"the first has {first.lever_arm}: one fit has one lever arm, and one band"
         same = (one.lever_arm, one.band) == (first.lever_arm, first.band)
         require(same, f"{one.name}: lever_arm", one.lever_arm, remedy)
     each = [
-        _nonparametric(recording, settings) if stiffness is None else stiffness
+        _nonparametric(recording, settings) if answer is None else answer
         for recording in recordings
     ]
     moved = [
-        _moved(recording, own, predicted, settings.rate)
+        _moved(recording, own, settings.rate)
         for recording, own in zip(recordings, each, strict=True)
     ]
-    share, said = _share_shown(moved, settings) if predicted is not None else (1.0, ())
+    share, said = _share_shown(moved, settings, one_way=each[0].one_way)
     pieces = [
         _fluctuation(*pair, share, said, settings.rate)
         for pair in zip(recordings, moved, strict=True)
     ]
     name = name_of_all([recording.name for recording in recordings]) if name is None else name
     target = pooled_target(pieces, name, "force", provenance, None, settings)
-    response = _pooled(moved, pieces, each[0], _band(recordings), settings.rate)
+    response = _pooled(moved, pieces, each[0].stiffness, _band(recordings), settings.rate)
     words = {"name": name, "source": target.source, "lever_arm": first.lever_arm}
     return target.with_stiffness(FrequencyResponse(*response, **words))
 
 
-def _nonparametric(recording: PerturbedRecording, settings: SpectrumSettings) -> Stiffness:
+def halves(recordings: Sequence[PerturbedRecording]) -> list[tuple[PerturbedRecording, ...]]:
+    """The first and the second half of every window; none where one is too short to be fitted."""
+    found = []
+    for one in recordings:
+        start, stop = one.window or (one.force.start, one.force.stop)
+        low, high = max(start, one.force.start + MARGIN), min(stop, one.force.stop - MARGIN)
+        middle = 0.5 * (low + high)
+        if middle - low <= 4 * MARGIN + 1 / one.rate:
+            return []
+        found.append([one.steady(pair) for pair in ((low, middle), (middle, high))])
+    return list(zip(*found, strict=True))
+
+
+def explained_power(
+    recordings: Sequence[PerturbedRecording],
+    answer: Answer,
+    band: tuple[float, float],
+    shown_by: Sequence[PerturbedRecording] | None = None,
+) -> Float[np.ndarray, "2"]:
+    """Of the power of the force in a band [Hz] what its answer to the motion explains, Σ |F|² - Σ
+    |F - H L - β Q|², over the ordinates in the band and the recordings, and Σ |F|²; β as other
+    recordings show it, or these."""
+    settings = recorded_settings(None)
+    rate, found = settings.rate, np.zeros(2)
+    moved = [_moved(one, answer, rate) for one in _in_newtons(recordings)]
+    others = [_moved(one, answer, rate) for one in _in_newtons(shown_by or ())]
+    share, _ = _share_shown(others or moved, settings, one_way=answer.one_way)
+    for one in moved:
+        f = one.frequency(rate)
+        inside = (band[0] <= f) & (f <= band[1])
+        whole, left = (
+            float(np.sum(np.abs(one.transform(x)[inside]) ** 2))
+            for x in (one.force, one.force - one.reply - share * one.bend)
+        )
+        found += [whole - left, whole]
+    return found
+
+
+def _in_newtons(recordings: Sequence[PerturbedRecording]) -> list[PerturbedRecording]:
+    return [one.at_lever_arm(LEVER_ARM) if one.of_joint else one for one in recordings]
+
+
+def _nonparametric(recording: PerturbedRecording, settings: SpectrumSettings) -> Answer:
     """The response that was measured, held beyond its ends: that makes no odds, since nothing moves
     there."""
     found = recording._response(recording._to_band(settings))
-    return lambda f: (
-        np.interp(f, found.frequency, np.real(found.value))
-        + 1j * np.interp(f, found.frequency, np.imag(found.value))
+    return Answer(
+        lambda f: (
+            np.interp(f, found.frequency, np.real(found.value))
+            + 1j * np.interp(f, found.frequency, np.imag(found.value))
+        )
     )
 
 
-def _moved(
-    recording: PerturbedRecording, stiffness: Stiffness, predicted: Any, rate: float
-) -> _Moved:
+def _moved(recording: PerturbedRecording, answer: Answer, rate: float) -> _Moved:
     force, moved = (x.resampled(rate).whole for x in (recording.force, recording.displacement))
     margin, (first, stop) = round(MARGIN * rate), recording.force.span(rate)
     first, stop = max(first, margin), min(stop, force.size - margin)
@@ -708,11 +764,13 @@ def _moved(
     )
     require(stop - first > 4 * margin, "window", recording.window, remedy)
     length = moved - np.mean(moved[first:stop])
-    return _Moved(force, length, *_reply(length, stiffness, predicted, rate), slice(first, stop))
+    return _Moved(force, length, *_reply(length, answer, rate), slice(first, stop))
 
 
-def _share_shown(moved: list[_Moved], settings: SpectrumSettings) -> tuple[float, tuple[str, ...]]:
-    """Which share β of the nonlinear muscle's own response q the recordings show, and what is to be
+def _share_shown(
+    moved: list[_Moved], settings: SpectrumSettings, *, one_way: bool
+) -> tuple[float, tuple[str, ...]]:
+    """Which share β of the response q beside the linear one the recordings show, and what is to be
     said of it.
 
     With the transforms E of F - h * l and Q of q, both without what in each group of frequencies is
@@ -720,16 +778,21 @@ def _share_shown(moved: list[_Moved], settings: SpectrumSettings) -> tuple[float
 
         β = Σ Re(Q* E) / S_E  /  Σ |Q|² / S_E,     sd² = 1 / (2 Σ |Q|² / S_E)
 
-    1 of a muscle as the model's, 0 of a linear one. So β = 1 unless the recordings contradict that
-    by four errors.
+    Of the nonlinear muscle's, 1 of a muscle as the model's, 0 of a linear one. So β = 1 unless the
+    recordings contradict that by 2.5 errors: a linear limb would have an H that is wrong by the
+    part of q that is in proportion to L, and that is of the size of the rest of q. Of a reflex, 1
+    of one to lengthening alone, 0 of a linear one. So β = 0 unless the recordings contradict that
+    by four errors. The sums go as far as the spectrum, and as far as the motion.
     """
     shown = weight = 0.0
     for one in moved:
         f = one.frequency(settings.rate)
         signals = (one.length, one.force - one.reply, one.bend)
         length, *others = (one.transform(x) for x in signals)
-        density = _smooth(f, np.abs(others[0]) ** 2)
-        grouped = _grouped(f, _groups([f], (0.0, float(settings.frequency[-1]))))
+        density, motion = (_smooth(f, np.abs(x) ** 2) for x in (others[0], length))
+        highest = min(float(f[motion >= LEAST_INPUT * motion.max()][-1]), HIGHEST)
+        highest = max(highest, float(settings.frequency[-1]))
+        grouped = _grouped(f, _groups([f], (0.0, highest)))
         sums = (grouped / density) @ (np.conj(length) * [length, *others]).T
         # a linear response that is somewhat wrong would be taken for a share of the nonlinear one
         slopes = sums[:, 1:] / np.maximum(np.real(sums[:, :1]), 1e-300)
@@ -739,15 +802,19 @@ def _share_shown(moved: list[_Moved], settings: SpectrumSettings) -> tuple[float
         weight += float(np.abs(bend) ** 2 @ inverse)
     if weight <= 0:
         return 1.0, ()
-    share, error = shown / weight, 1 / np.sqrt(2 * weight)
+    share, error = shown / weight, float(1 / np.sqrt(2 * weight))
+    size = float(np.std(np.concatenate([one.bend[one.inside] for one in moved])))
+    if one_way:
+        seen = share > SURELY * error
+        return (share, (ONE_WAY.format(100 * share, 100 * error, size),)) if seen else (0.0, ())
     if abs(share - 1) <= FROM_ALL * error:
         return 1.0, ()
-    size = np.sqrt(np.mean(np.concatenate([one.bend[one.inside] for one in moved]) ** 2))
+    told = abs(share - 1) > max(SURELY * error, DIFFERENT)
     which, taken = "less" if share < 1 else "more", "that share"
     words = UNLIKE.format(which, size, 100 * share, 100 * error, taken)
     if abs(share) <= FROM_NONE * error:
         words, share = UNLIKE.format(which, size, 100 * share, 100 * error, "none of it"), 0.0
-    return share, (words,) * (abs(share - 1) > DIFFERENT)
+    return share, (words,) * told
 
 
 def _fluctuation(
@@ -773,11 +840,9 @@ def _fluctuation(
     )
 
 
-def _reply(
-    length: Times, stiffness: Stiffness, predicted: Any, rate: float
-) -> tuple[Times, Times, bool]:
-    """What the force does when it follows the lengthening linearly, right from the margin on; by
-    how much `predicted` differs; and whether that is known."""
+def _reply(length: Times, answer: Answer, rate: float) -> tuple[Times, Times, bool]:
+    """What the force does when it follows the lengthening linearly, right from the margin on; what
+    it does beside that; and whether that is known."""
     edge = round(0.5 * MARGIN * rate)
     ramp = np.sin(0.5 * np.pi * (np.arange(edge) + 0.5) / edge) ** 2
     tapered = length.copy()
@@ -790,18 +855,18 @@ def _reply(
     # the stiffness costs a solution of the model for each frequency, and is smooth: at nodes that
     # are close together where it bends most, with splines between them
     nodes = np.sinh(np.linspace(0.0, 6.0, NODES)) / np.sinh(6.0) * rate / 2
-    smooth = scipy.interpolate.CubicSpline(nodes, stiffness(nodes))(f)
+    smooth = scipy.interpolate.CubicSpline(nodes, answer.stiffness(nodes))(f)
     reply = np.fft.irfft(smooth * moved, len(length))
-    if predicted is not None:
+    if answer.beside is not None:
         fine, turn = HALF_STEPS * len(length), 2j * np.pi * f
         motion = np.stack(
             [HALF_STEPS * np.fft.irfft(turn**order * moved, fine) for order in (0, 1, 2)]
         )
         motion = np.append(motion, motion[:, :1], axis=1)  # which is periodic
-        whole = predicted(motion, 1 / (HALF_STEPS * rate))[:: HALF_STEPS // 2][: len(length)]
-        if np.all(np.isfinite(whole)):
-            return reply, whole - reply, True
-    return reply, np.zeros_like(reply), predicted is None
+        bend = answer.beside(motion, 1 / (HALF_STEPS * rate), reply)
+        if np.all(np.isfinite(bend)):
+            return reply, bend, True
+    return reply, np.zeros_like(reply), answer.beside is None
 
 
 def _checked_band(band: Any, rate: float) -> tuple[float, float] | None:

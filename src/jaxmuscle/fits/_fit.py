@@ -1,7 +1,8 @@
 """Fit of a task's parameters to a target spectrum, in linear response or by Monte Carlo; to several
 targets of one person together."""
 
-from collections.abc import Callable, Mapping
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Unpack, overload
 
 from jaxmuscle._common.arguments import check_options
@@ -17,11 +18,12 @@ from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.model._tasks import PrescribedLength
 from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import Plan, at_mean, planned
+from jaxmuscle.objective._derived import seen_band
 from jaxmuscle.objective._options import FitOptions, JointFitOptions, OneFitOptions
 
 from ._joint import fit_jointly
 from ._model_choice import Models, first_rung, options_for
-from ._perturbed import ANEW, alike, analysed, recordings_of, seen_with, without_rhythm
+from ._perturbed import ANEW, alike, analysed, explained, recordings_of, seen_with, without_rhythm
 from ._reflex import planned_with_reflex
 from ._result import FitResult
 from ._search import search
@@ -171,7 +173,39 @@ def fit(
         models = _models(task, target, given, top, recordings)
         plan = models.plan_at(models.first)
         several = top > models.lowest or models.with_reflex is not None
-        return search(plan, answer, models if several else None)
+
+        def completed(found: FitResult) -> FitResult:
+            given.progress("what it explains of the other half", 0.95)
+            return _explained(found, recordings, task, given, models.first)
+
+        done = completed if recordings else None
+        return search(plan, answer, models if several else None, done)
+
+
+def _explained(
+    result: FitResult,
+    recordings: tuple[PerturbedRecording, ...],
+    task: AbstractTask,
+    given: FitOptions,
+    first: int,
+) -> FitResult:
+    """With the share of the variance of the force that the fitted task explains."""
+    fitted, response = result.task, result.target.stiffness
+    if not result.success or type(fitted) is not PrescribedLength or response is None:
+        return result
+    number = next((rung.number for rung in result.ladder if rung.chosen), first)
+
+    def planned_for(target: Target, some: Sequence[PerturbedRecording]) -> Plan:
+        models = _models(task, target, given, number, tuple(some))
+        if fitted.reflex is not None and models.with_reflex is not None:
+            return models.with_reflex(number, None)
+        return models.plan_at(number)
+
+    known = response.known
+    low, high = seen_band(known.frequency, known.value, known.stderr).tolist()
+    shares = explained(fitted, recordings, (low, high), planned_for, given.max_steps)
+    ((name, part),) = result.parts.items()
+    return dataclasses.replace(result, parts={name: dataclasses.replace(part, explained=shares)})
 
 
 def _models(

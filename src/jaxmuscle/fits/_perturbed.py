@@ -3,7 +3,7 @@ the model that is fitted. `_fit.py`, `_joint.py` and `_cohort.py` begin with it.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -11,13 +11,20 @@ import numpy as np
 
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._frequency_response import UNSEEN, check_seen
-from jaxmuscle.data._perturbed import PerturbedRecording, perturbed_target
+from jaxmuscle.data._perturbed import (
+    HALF_STEPS,
+    Answer,
+    PerturbedRecording,
+    explained_power,
+    halves,
+    perturbed_target,
+)
 from jaxmuscle.data._target import Target
 from jaxmuscle.data._two_channels import perturbed_recordings
 from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.model._rungs import is_base
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
-from jaxmuscle.objective._arguments import at_mean, planned
+from jaxmuscle.objective._arguments import Plan, at_mean, planned
 from jaxmuscle.objective._least_squares import least_squares
 from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._starts import starting_points
@@ -59,20 +66,74 @@ def without_rhythm(task: AbstractTask, options: FitOptions) -> AbstractTask:
 
 
 def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) -> Target:
-    """The target with the response of a task's nonlinear muscle taken off, or of the linear one
-    where that is not finite."""
+    """The target with the answer of a task taken off."""
+    return perturbed_target(recordings, answer_of(muscle))
+
+
+def answer_of(muscle: AbstractTask) -> Answer:
+    """How the force of a moved muscle answers: of the nonlinear muscle, or of the linear one and a
+    reflex that may answer lengthening alone.
+
+    A reflex of twice the gain that answers max(v, 0), v the velocity, is the linear one and, beside
+    it, one that answers |v|: 2 max(v, 0) = v + |v|. (Its mean is left in the force.)
+    """
     assert isinstance(muscle, PrescribedLength)
 
     def stiffness(f: np.ndarray) -> np.ndarray:
         return np.asarray(dynamic_stiffness(muscle, f))
 
-    if muscle.reflex is not None:  # a delay is known to the linear response only
-        return perturbed_target(recordings, stiffness)
+    def nonlinear(motion: np.ndarray, interval: float, reply: np.ndarray) -> np.ndarray:
+        whole = driven(muscle, -motion, interval)  # at every second time of the motion
+        return whole[:: HALF_STEPS // 2][: len(reply)] - reply
 
-    def predicted(motion: np.ndarray, interval: float) -> np.ndarray:
-        return driven(muscle, -motion, interval)
+    if muscle.reflex is None:
+        return Answer(stiffness, nonlinear)
+    tissues = muscle.with_parts(reflex=None)
 
-    return perturbed_target(recordings, stiffness, predicted=predicted)
+    def rectified(motion: np.ndarray, interval: float, reply: np.ndarray) -> np.ndarray:
+        f = np.fft.rfftfreq(len(reply), HALF_STEPS * interval)[1:]
+        speed = np.fft.rfft(np.abs(motion[1][:-1]))[1 : len(f) + 1] / HALF_STEPS
+        own = stiffness(f) - np.asarray(dynamic_stiffness(tissues, f))
+        return np.fft.irfft(np.append(0.0, own / (2j * np.pi * f) * speed), len(reply))
+
+    return Answer(stiffness, rectified, one_way=True)
+
+
+def explained(
+    task: PrescribedLength,
+    recordings: Sequence[PerturbedRecording],
+    band: tuple[float, float],
+    planned_for: Callable[[Target, Sequence[PerturbedRecording]], Plan],
+    max_steps: int,
+) -> dict[str, float]:
+    """Which share of the variance of the force in a band [Hz] the fitted task explains: 1 - Σ |F -
+    H L|² / Σ |F|² with the transforms of force and lengthening.
+
+    `low` and `high` of the band; `together`; with a reflex `tissues`, what H without it explains,
+    and `reflex`, what it adds; `other_half`, what a fit to one half of every window explains of the
+    other one, for both halves. (The answer that is refined by what a half shows is that of the
+    whole: to first order no bias, see docs/reflex.md.)
+    """
+
+    def share(muscle: AbstractTask) -> float:
+        power, whole = explained_power(recordings, answer_of(muscle), band)
+        return float(power / whole)
+
+    found = {"low": band[0], "high": band[1], "together": share(task)}
+    if task.reflex is not None:
+        found["tissues"] = share(task.with_parts(reflex=None))
+        found["reflex"] = found["together"] - found["tissues"]
+    each, sums = halves(recordings), np.zeros(2)
+    for one, other in zip(each, each[::-1], strict=True):
+        plan = planned_for(seen_with(task, one), one)
+        c = plan.problem.coordinates
+        point = c.from_theta(c.at(np.array([[float(task[name]) for name in c.names]])))
+        fitted = least_squares(plan.problem.linear(), np.asarray(point), max_steps)
+        if not np.isfinite(fitted.cost[fitted.best]):
+            return found
+        (half,) = plan.problem.tasks_at(np.asarray(c.theta(fitted.s[fitted.best])))
+        sums += explained_power(other, answer_of(half), band, shown_by=one)
+    return found | ({"other_half": float(sums[0] / sums[1])} if each else {})
 
 
 def alike(one: Target, other: Target) -> bool:

@@ -290,6 +290,15 @@ class PartTable(Table, kw_only=True):
             " the fit had it as data"
         ),
     ]
+    explained: Annotated[
+        dict[str, float],
+        says(
+            "Of a moved limb, shares of the variance of the force from `low` to `high` [Hz] that"
+            " the response explains: `together`, `tissues`, `reflex`, and `other_half`, that of the"
+            " half of the recording that was left out (docs/reflex.md); else empty",
+            missing="none is known",
+        ),
+    ] = msgspec.field(default_factory=dict)
     stiffness: Annotated[
         tuple[list[float], list[float]] | None,
         says(
@@ -361,7 +370,7 @@ ALIASES = {"activation_time": "contraction_time"}
 SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
 TRACES = ("stretch", "recorded")
 STRETCH = ("time", "output")
-SAME_OF_PART = ("chi2_per_bin", "rms_log_error", "check", "further")
+SAME_OF_PART = ("chi2_per_bin", "rms_log_error", "check", "further", "explained")
 
 
 class Estimate(Shown, eqx.Module):
@@ -457,7 +466,9 @@ class FittedPart(eqx.Module):
     `check`, how far linear response and nonlinear simulation differ; `further`, residuals of the
     coefficient of variation and of the mean, as far as they are data [standard deviations],
     positive where the model is above the data; `stiffness`, the fitted dynamic stiffness [N/m] at
-    the frequencies of the target's.
+    the frequencies of the target's; `explained`, of a recording of a moved limb, which shares of
+    the variance of the force from `low` to `high` [Hz] the response explains: `together`, `tissues`
+    without a reflex, what the `reflex` adds, and of the half that was left out, `other_half`.
     """
 
     target: Target
@@ -474,6 +485,7 @@ class FittedPart(eqx.Module):
     check: dict[str, float | int]
     further: dict[str, float]
     stiffness: Complex[np.ndarray, " points"] | None = None
+    explained: dict[str, float] = eqx.field(default_factory=dict)
 
     @property
     def frequency_hz(self) -> Float[np.ndarray, " bins"]:

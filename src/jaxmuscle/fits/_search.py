@@ -149,14 +149,13 @@ class _Search:
         if models.reflex == "auto" and found.rung.aic > without.rung.aic - REFLEX_MARGIN:
             self.reflex = test._replace(fitted=False)
             return
+        others = [msgspec.structs.replace(rung, chosen=False) for rung in self.ladder]
+        self.ladder = (*others, found.rung)
         self.keep(found)
         if models.renewed is not None:
             seen_by = _reached(self.plan, self.stages)[0]
             again = models.with_reflex(without.rung.number, seen_by)
-            found = self._with_reflex(again, found, test) or found
-            self.keep(found)
-        others = [msgspec.structs.replace(rung, chosen=False) for rung in self.ladder]
-        self.ladder = (*others, found.rung)
+            self.keep(self._with_reflex(again, found, test) or found)
 
     def _with_reflex(self, plan: Plan, best: Climbed, test: ReflexTest) -> Climbed | None:
         """A model with a reflex, fitted from where another one ended; None where no search ends."""
@@ -173,12 +172,15 @@ class _Search:
 
 
 def search(
-    plan: Plan, answer: Callable[[FitResult], None] | None = None, models: Models | None = None
+    plan: Plan,
+    answer: Callable[[FitResult], None] | None = None,
+    models: Models | None = None,
+    completed: Callable[[FitResult], FitResult] | None = None,
 ) -> FitResult:
     """From the starting points to a result; Ctrl-C ends it with what had been reached.
 
     `answer` gets the result before its checks; Ctrl-C in these keeps it. Of several `models` one
-    after the other is tried until one describes the data.
+    after the other is tried until one describes the data. What is `completed` is the result.
     """
     run = _Search(plan)
     try:
@@ -202,6 +204,8 @@ def search(
         if run.reflex is not None and not (run.reflex.seen and run.reflex.fitted):
             said = (run.reflex.notice, *result.notices)
             result = dataclasses.replace(result, notices=said)
+        if completed is not None:
+            result = completed(result)
         if answer is not None and not plan.check_seeds:
             answer(result)
     except KeyboardInterrupt:

@@ -177,15 +177,17 @@ def tangents(task: Any, mean: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
     }
 
 
+def seen_band(frequency: np.ndarray, value: np.ndarray, stderr: np.ndarray) -> np.ndarray:
+    """The band that was moved: the first and the last frequency of a measured dynamic stiffness at
+    which it is more than `SEEN` standard errors large; those of all where none is."""
+    seen = np.flatnonzero(np.abs(value) > SEEN * stderr)
+    return frequency[seen[[0, -1]] if len(seen) else [0, -1]]
+
+
 def thirds(frequency: np.ndarray, value: np.ndarray, stderr: np.ndarray) -> np.ndarray:
     """Which points of a measured dynamic stiffness stand for the thirds of the band that was moved:
-    those nearest to their middles, on a log scale.
-
-    The band goes from the first to the last point that is more than `SEEN` standard errors large;
-    over all points where none is.
-    """
-    seen = np.flatnonzero(np.abs(value) > SEEN * stderr)
-    low, high = np.log(frequency[seen[[0, -1]] if len(seen) else [0, -1]])
+    those nearest to their middles, on a log scale."""
+    low, high = np.log(seen_band(frequency, value, stderr))
     middles = low + (high - low) * np.array([1, 3, 5]) / 6
     return np.argmin(np.abs(np.log(frequency)[:, None] - middles), axis=0)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import WIDTH, folded, probability
+from jaxmuscle.data._frequency_response import JOINT
 from jaxmuscle.data._measured import is_recorded, tremor_band
 from jaxmuscle.data._measured_text import (
     BY_ITSELF,
@@ -50,14 +51,17 @@ ALL = {
 SHOWN = {name: words for name, words in ALL.items() if name != "standard_deviation"}
 FEW = {n: SHOWN[n] for n in ("mean", "coefficient_of_variation", "relative_power_8_12")}
 # numbers of the model that it prints, in words: of a held force, and of a moved limb
+REFLEX_ROWS = {
+    "reflex_gain": "reflex, gain",
+    "reflex_delay": "reflex, delay",
+    "reflex_time": "reflex, contraction time",
+}
 RHYTHMS = {
     "resonance_frequency": "resonance of the drive",
     "resonance_2_frequency": "second resonance",
     "harmonic_frequency": "regular rhythm",
     "half_power_frequency": "half-power frequency",
-    "reflex_gain": "reflex, gain",
-    "reflex_delay": "reflex, delay",
-    "reflex_time": "reflex, contraction time",
+    **REFLEX_ROWS,
 }
 OF_LIMB = {
     "tangent_stiffness": "tangent_stiffness, H(0)",
@@ -93,6 +97,10 @@ CHOSEN = (
 )
 IN_SERIES = "active and passive tissue in series"  # where no spectrum was fitted
 REPORT = "Report only what is measured."
+# share of the variance of a half that was not fitted, from which on a model of a moved limb that
+# does not fit is described
+MOSTLY = 0.8
+AS_FAR = "Its numbers describe the limb as far as that goes:"
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 
 
@@ -152,9 +160,12 @@ def fit_text(result: FitResult, saved: str | None = None) -> str:
         if len(result.parts) > 1 or (part.stiffness is not None and not missed):
             words = {n: FEW[n] for n in ("mean", "coefficient_of_variation")}
         lines += _measured(result, name, part, words)
+        lines += _measured_response(part) if missed else []
     lines += _judged(result)
     if result.success and not missed:
         lines += _results(result, saved)
+    elif _is_described(result):
+        lines += _description(result)
     checks = _checks(result)
     several, hidden = len(result.parts) > 1, len(checks)
     if not missed:
@@ -211,6 +222,54 @@ def _measured(
     ]
 
 
+def _measured_response(part: FittedPart) -> list[str]:
+    """The dynamic stiffness that was measured, in the thirds of the band."""
+    if part.target.stiffness is None or not part.thirds:
+        return []
+    found = part.target.stiffness.known
+    arm, unit = found.lever_arm or 1.0, JOINT if found.lever_arm else "N/m"
+    lines = []
+    for f in dict.fromkeys(part.thirds):
+        i = int(np.argmin(np.abs(found.frequency - f)))
+        H, error = found.value[i], found.stderr[i]
+        gain = Estimate(arm**2 * float(np.abs(H)), unit, arm**2 * float(error))
+        turn = float(np.degrees(error / np.abs(H)))
+        phase = Estimate(float(np.degrees(np.angle(H))), "deg", turn)
+        lines.append(f"  {f'H({f:.2g} Hz)':<{WIDE}}{_briefly(gain)}, {_briefly(phase)}")
+    return lines
+
+
+def _explained(part: FittedPart) -> list[str]:
+    """Which share of the variance of the force the response explains."""
+    shares = part.explained
+    if not shares:
+        return []
+    said = (
+        f"explains {100 * shares['together']:.1f} % of the variance of the force,"
+        f" {shares['low']:.2g} to {shares['high']:.2g} Hz"
+    )
+    if "reflex" in shares:
+        alone, more = 100 * shares["tissues"], 100 * shares["reflex"]
+        said += f" (tissues {alone:.1f} %, reflex {more:.1f} %)"
+    if "other_half" in shares:
+        said += f"; {100 * shares['other_half']:.1f} % in the half that is not fitted"
+    return [f"  {said}"]
+
+
+def _is_described(result: FitResult) -> bool:
+    """Whether a model of a moved limb foretells most of what it was not fitted to."""
+    each = [part.explained for part in result.parts.values() if part.stiffness is not None]
+    return bool(each) and all(one.get("other_half", 0.0) >= MOSTLY for one in each)
+
+
+def _description(result: FitResult) -> list[str]:
+    """What holds of the limb whatever its tissues are, and the reflex."""
+    shown = _about_axis(result, result.as_shown(result.found))
+    limb = {n: p for n, p in shown.items() if base_of(n) in set(LIMB) - {*GAINS, *PHASES}}
+    known = {n: p for n, p in shown.items() if base_of(n) in REFLEX_ROWS and p.stderr is not None}
+    return [*_of_limb(result, limb), *(_row(n, p, REFLEX_ROWS) for n, p in known.items())]
+
+
 def _judged(result: FitResult) -> list[str]:
     """The model, and whether it describes the data."""
     if not result.success:
@@ -221,19 +280,24 @@ def _judged(result: FitResult) -> list[str]:
         reflex = "reflex_gain" in result.parameters
         name = IN_SERIES + f" + {REFLEX}" * reflex
     verdict = result.adequacy
+    shares = [line for part in result.parts.values() for line in _explained(part)]
     if verdict is None:
-        return [f"MODEL  {name}: {result.verdict}"]
+        return [f"MODEL  {name}: {result.verdict}", *shares]
     if verdict.adequate:
-        return [f"MODEL  {name}: fits, {probability(verdict.p)}"]
+        return [f"MODEL  {name}: fits, {probability(verdict.p)}", *shares]
+    closing = AS_FAR if _is_described(result) else REPORT
     return [
         f"MODEL  {name}: does NOT fit, {probability(verdict.p)}",
-        f"  {verdict.misfit[0].upper()}{verdict.misfit[1:]}. {REPORT}",
+        *shares,
+        f"  {verdict.misfit[0].upper()}{verdict.misfit[1:]}. {closing}",
     ]
 
 
 def _results(result: FitResult, saved: str | None) -> list[str]:
     """What is known of the model, in rows, and what these data do not tell."""
-    every, shown = result.as_shown(result.found), result.as_shown(result.determined)
+    every, shown = (
+        _about_axis(result, result.as_shown(table)) for table in (result.found, result.determined)
+    )
     recorded = any(is_recorded(part.target.measured) for part in result.parts.values())
     several = len(result.parts) > 1
     moved = any(part.stiffness is not None for part in result.parts.values())
@@ -251,9 +315,8 @@ def _results(result: FitResult, saved: str | None) -> list[str]:
         seen = "seen" if p < 0.05 else "none seen"
         lines.append(f"  {'regular rhythm (harmonic)':<{WIDE}}{seen}, {probability(p)}")
     lines += [_row(name, p, rhythms) for name, p in rows.items()]
-    rows |= {n: p for n, p in limb.items() if p.stderr is not None or p.interval is not None}
+    rows |= {n: p for n, p in limb.items() if _is_known(p)}
     lines += [f"   {_per_newton(result, rows)}"] * bool(_per_newton(result, rows))
-    lines += _about_axis(result)
     if recorded and not moved and len(result.ladder) > 1:
         lines.append(f"  {CHOSEN}")
     loose = [n for n, p in every.items() if p.stderr is None and p.free and n not in rows]
@@ -266,10 +329,14 @@ def _results(result: FitResult, saved: str | None) -> list[str]:
     return lines
 
 
+def _is_known(p: Estimate) -> bool:
+    return p.stderr is not None or p.interval is not None
+
+
 def _of_limb(result: FitResult, found: Mapping[str, Estimate]) -> list[str]:
     """First what holds of a moved limb whatever its tissues are, then what if there are two in
     series; of what is known the value with its error, or the interval alone."""
-    known = {n: p for n, p in found.items() if p.stderr is not None or p.interval is not None}
+    known = {n: p for n, p in found.items() if _is_known(p)}
     whatever = [n for base in LIMB for n in known if base_of(n) == base]
     lines = [_row(n, known[n], OF_LIMB) for n in whatever if base_of(n) not in {*GAINS, *PHASES}]
     for key, part in result.parts.items():
@@ -283,12 +350,12 @@ def _of_limb(result: FitResult, found: Mapping[str, Estimate]) -> list[str]:
     return [*lines, *[f" {IN_SERIES_ONLY}"] * bool(tissues), *tissues]
 
 
-def _row(name: str, p: Estimate, words: Mapping[str, str]) -> str:
+def _row(name: str, p: Estimate, words: Mapping[str, str], wide: int = WIDE) -> str:
     """A number with its interval."""
     base, at, target = name.partition("@")
     said = words.get(base, base) + f", {target}" * bool(at)
     interval = p.interval_in_words() if p.stderr is not None else ""
-    return f"  {said:<{WIDE}}{_briefly(p):<25} {interval}".rstrip()
+    return f"  {said:<{wide}}{_briefly(p):<25} {interval}".rstrip()
 
 
 def _briefly(p: Estimate) -> str:
@@ -298,22 +365,22 @@ def _briefly(p: Estimate) -> str:
     return said + f" {p.unit}" * (p.unit not in ("1", ""))
 
 
-def _about_axis(result: FitResult, wide: int = WIDE) -> list[str]:
-    """The numbers of a joint: those of stiffness, damping and mass times the square of the lever
-    arm."""
+def _lever_arm(result: FitResult) -> float | None:
+    """At which distance [m] from the axis of a joint its numbers in N and m are; None of others."""
     responses = (part.target.stiffness for part in result.parts.values())
-    arm = next((one.lever_arm for one in responses if one is not None and one.lever_arm), None)
-    if arm is None:
-        return []
-    units = dict(zip(UNITS["N/m"], UNITS["N m/rad"], strict=True))
-    lines = [f"  About the axis of the joint (those in N and m are at {arm:g} m from it):"]
-    for name, p in result.as_shown(result.determined).items():
-        own = {*LIMB, *TISSUES, "reflex_gain"} - set(GAINS)
-        if base_of(name) in own and p.unit in units:
-            one = p.times(arm**2, units[p.unit])
-            number = f"{one.in_words()} {one.unit}"
-            lines.append(f"  {name:<{wide}}{number:<25} {one.interval_in_words()}".rstrip())
-    return lines if len(lines) > 1 else []
+    return next((one.lever_arm for one in responses if one is not None and one.lever_arm), None)
+
+
+def _about_axis(result: FitResult, table: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Numbers of a limb, those of a joint about its axis: stiffness, damping and mass times the
+    square of the lever arm."""
+    arm = _lever_arm(result)
+    units = dict(zip(UNITS["N/m"], UNITS[JOINT], strict=True))
+    own = {*LIMB, *TISSUES, "reflex_gain"}
+    return {
+        n: p.times(arm**2, units[p.unit]) if arm and base_of(n) in own and p.unit in units else p
+        for n, p in table.items()
+    }
 
 
 def unknown_kinds(loose: Iterable[str], known: Iterable[str]) -> list[str]:
@@ -426,7 +493,11 @@ def _whole_model(result: FitResult) -> list[str]:
         else "would be determined if the model held"
     )
     lines = _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
-    lines += _about_axis(result, 18)
+    joint = _about_axis(result, every)
+    turned = [_row(n, p, {}, 18) for n, p in joint.items() if p is not every[n] and _is_known(p)]
+    if turned:
+        at = f"those in N and m are at {_lever_arm(result):g} m from it"
+        lines += [f"  about the axis of the joint ({at}):", *turned]
     lines += [f"  {sentence}" for sentence in (*_counted(rows, every), *_by_band(result, bands))]
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
     alone = {name: p for name, p in loose.items() if p.interval is not None}
