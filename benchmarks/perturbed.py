@@ -243,37 +243,45 @@ def amplitude(count: int) -> None:
 
 
 def reflex(count: int) -> None:
-    """A drive that follows the lengthening, late, through the twitch: the reflex."""
-    for late in (0.03, 0.05):
-        for strength in (0.0, 0.1, 0.3, 1.0):
+    """A drive that follows the lengthening, late, through the twitch: the reflex. To length and
+    velocity, moved to 5 Hz and fitted without one; and to velocity, moved to 20 Hz."""
+    for high, how, length in ((5.0, "none", 1.0), (20.0, "auto", 0.0)):
+        for late in (0.03, 0.05):
+            for strength in (0.0, 0.1, 0.3, 1.0):
 
-            def pull(s: np.ndarray, late: float = late, strength: float = strength) -> np.ndarray:
-                return 100.0 * strength * (1 + 0.1 * s) * np.exp(-s * late) / (1 + 0.04 * s) ** 2
+                def pull(
+                    s: np.ndarray,
+                    late: float = late,
+                    strength: float = strength,
+                    length: float = length,
+                ) -> np.ndarray:
+                    return (
+                        100
+                        * strength
+                        * (length + 0.1 * s)
+                        * np.exp(-s * late)
+                        / (1 + 0.04 * s) ** 2
+                    )
 
-            runs = recorded(TASK, np.random.default_rng(3), count, reflex=pull)
-            print(f"reflex {strength:g} of the stiffness at rest, late by {1e3 * late:g} ms")
-            fits = [jm.fit(TASK, run, **QUICK) for run in runs]
-            told(fits)
-            for name, true in tangents().items():
-                off = [
-                    100 * (fit[name].value / true - 1)
-                    for fit in fits
-                    if fit[name].stderr is not None
-                ]
+                rng, motion = np.random.default_rng(3), (1e-3, high)
+                runs = recorded(TASK, rng, count, motion=motion, reflex=pull)
                 print(
-                    f"muscle {name}: known {len(off)}/{count}, off by"
-                    f" {np.mean(off) if off else np.nan:+.0f} % (mean)"
+                    f"reflex {strength:g} of the stiffness at rest, late by {1e3 * late:g} ms,"
+                    f" moved to {high:g} Hz, fitted with reflex={how!r}"
                 )
-            masses = [fit["m_z"] for fit in fits]
-            spread(
-                "muscle m_z",
-                [m.value for m in masses],
-                [float(m.stderr or np.nan) for m in masses],
-                float(TASK["m_z"]),
-            )
-            if strength == 1.0:
-                print("the same, fitted with the true m_z")
-                told([jm.fit(TASK, run, fix={"m_z": float(TASK["m_z"])}, **QUICK) for run in runs])
+                fits = [jm.fit(TASK, run, reflex=how, **QUICK) for run in runs]
+                told(fits)
+                seen = sum("reflex_gain" in fit.parameters for fit in fits)
+                print(f"  a reflex is fitted in {seen} of {count}")
+                for name, true in tangents().items():
+                    off = [100 * (fit[name].value / true - 1) for fit in fits]
+                    ends = [fit[name].interval for fit in fits if fit[name].interval is not None]
+                    print(
+                        f"  {name}: off by {np.mean(off):+.0f} % (mean), scatter"
+                        f" {np.std(off, ddof=1):.0f} %; interval {len(ends)} times, holds"
+                        f" {sum(_holds(each, true) for each in ends)}",
+                        flush=True,
+                    )
 
 
 def inertia(count: int) -> None:
@@ -506,7 +514,7 @@ def seconds(count: int) -> None:
         told(
             [
                 jm.fit(TASK, run, **QUICK)
-                for run in recorded(TASK, np.random.default_rng(5), count, length, rms)
+                for run in recorded(TASK, np.random.default_rng(5), count, length, (rms, 5.0))
             ]
         )
 
@@ -778,7 +786,7 @@ def time(count: int) -> None:
     """Processor time, when warm, of a whole fit of a minute moved, of a minute held and of the
     bundled spectrum."""
     (moved,) = recorded(KNEE, np.random.default_rng(8), 1)
-    (held,) = recorded(KNEE, np.random.default_rng(9), 1, rms=1e-9)  # m, which no force shows
+    (held,) = recorded(KNEE, np.random.default_rng(9), 1, motion=(1e-9, 5.0))  # m, unseen
     spectrum = jm.load_target("vastus-lateralis-26mvc")
     given = {
         "moved": (TASK, moved),

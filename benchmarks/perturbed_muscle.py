@@ -11,6 +11,7 @@ import jaxmuscle as jm
 
 DT = 0.00125  # s between samples of the inputs; a Runge-Kutta step takes two
 MARGIN = 4.0  # s before and after the window
+MOTION = (1e-3, 5.0)  # rms [m], highest frequency [Hz]
 EVERY = 2  # steps from sample to sample of a recording
 
 
@@ -82,15 +83,17 @@ def recorded(
     rng: np.random.Generator,
     rows: int,
     seconds: float = 60.0,
-    rms: float = 1e-3,
+    motion: tuple[float, float] = MOTION,
     *,
     reflex: Callable[[np.ndarray], np.ndarray] | None = None,
     mass: float = 0.0,
     line: float = 0.0,
 ) -> list[jm.data.PerturbedRecording]:
-    """Recordings of the muscle with noise on its stiffnesses; `reflex`, drive over lengthening;
+    """Recordings of the muscle with noise on its stiffnesses; `motion`, its rms [m] and highest
+    frequency [Hz]; `reflex`, drive over lengthening;
     `mass` of a rig; `line`, of which relative amplitude a sine of 4.25 Hz is in both."""
-    sines = Sines(rng, seconds + 2 * MARGIN, rows)
+    rms, high = motion
+    sines = Sines(rng, seconds + 2 * MARGIN, rows, high=high)
     s = 2j * np.pi * sines.f
     x, v, a = (sines(rms * s**n) for n in range(3))
     low = scipy.signal.butter(2, 50.0, fs=1 / DT, output="sos")

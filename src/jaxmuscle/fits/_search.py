@@ -31,6 +31,7 @@ from jaxmuscle.response._linearised import settled
 
 from ._checks import AMBIGUOUS
 from ._model_choice import Climbed, Models, climb, rung_of
+from ._perturbed import alike
 from ._reflex import ReflexTest, look_for_reflex, starts_with_reflex
 from ._report import UNCHECKED, report_fit
 from ._result import FitResult, Rung
@@ -135,7 +136,7 @@ class _Search:
 
     def look_for_reflex(self, models: Models) -> None:
         """Test the best model for a reflex that it lacks, and go on with one that is seen; of
-        recordings a second time, with the target that muscle and reflex see."""
+        recordings again, with the target that muscle and reflex see."""
         without = self.best
         if without is None or models.with_reflex is None:
             return
@@ -152,10 +153,16 @@ class _Search:
         others = [msgspec.structs.replace(rung, chosen=False) for rung in self.ladder]
         self.ladder = (*others, found.rung)
         self.keep(found)
-        if models.renewed is not None:
+        # what is taken off the recordings beside the linear answer is that of the reflex found
+        for _ in range(RENEWALS if models.renewed is not None else 0):
             seen_by = _reached(self.plan, self.stages)[0]
             again = models.with_reflex(without.rung.number, seen_by)
-            self.keep(self._with_reflex(again, found, test) or found)
+            if alike(*(plan.problem.parts[0].target for plan in (self.plan, again))):
+                return
+            found = self._with_reflex(again, found, test)
+            if found is None:
+                return
+            self.keep(found)
 
     def _with_reflex(self, plan: Plan, best: Climbed, test: ReflexTest) -> Climbed | None:
         """A model with a reflex, fitted from where another one ended; None where no search ends."""
