@@ -9,7 +9,8 @@ import pytest
 import jaxmuscle as jm
 from jaxmuscle.data._perturbed import explained_power
 from jaxmuscle.fits._perturbed import answer_of, explained, seen_with
-from jaxmuscle.fits._reflex import DELAYS, ReflexTest, planned_with_reflex
+from jaxmuscle.fits._reflex import DELAYS, ReflexTest, with_reflex
+from jaxmuscle.objective._arguments import planned
 from jaxmuscle.objective._options import FitOptions
 
 F = np.geomspace(0.5, 30.0, 45)
@@ -27,13 +28,17 @@ def ankle(f, gain):
     return (0.02 * s**2 + z - z**2 / d + z / d * reflex) / ARM**2
 
 
-@functools.cache
-def fitted(gain, reflex="auto", seed=1):
+def response(gain, seed=1):
     generator, sd = np.random.default_rng(seed), 0.03 * np.abs(ankle(F, 0.0))
     noise = generator.normal(size=F.size) + 1j * generator.normal(size=F.size)
-    given = jm.data.FrequencyResponse(F, ankle(F, gain) + sd * noise, sd, name="ankle")
+    return jm.data.FrequencyResponse(F, ankle(F, gain) + sd * noise, sd, name="ankle")
+
+
+@functools.cache
+def fitted(gain, reflex="auto"):
     # m_w is 4 kg at this arm
-    return jm.fit(jm.PrescribedLength(m_w=4.0, m_z=8.0), given, reflex=reflex, starts=32)
+    task = jm.PrescribedLength(m_w=4.0, m_z=8.0)
+    return jm.fit(task, response(gain), reflex=reflex, starts=32)
 
 
 def test_a_reflex_is_told_from_the_muscle():
@@ -51,6 +56,19 @@ def test_a_reflex_is_told_from_the_muscle():
     assert found.ladder[-1].chosen and found.ladder[-1].model.endswith(" + stretch reflex")
     text = str(found)
     assert "stretch reflex: fits" in text and "reflex, delay" in text
+
+
+def test_two_records_of_one_person_have_one_reflex():
+    """Whose gain they tell better than one of them."""
+    tasks = dict.fromkeys(("left", "right"), muscle(0.0))
+    aims = {"left": response(6.0), "right": response(6.0, seed=2)}
+    assert "reflex_gain" not in jm.fit(tasks, aims, reflex="none").parameters
+    found = jm.fit(tasks, aims)
+    gain, alone = found.parameters["reflex_gain"], fitted(6.0).parameters["reflex_gain"]
+    assert found.adequate and abs(gain.value - 6.0 / ARM**2) < 3.5 * gain.stderr
+    assert 0.5 < gain.stderr / alone.stderr < 0.9
+    low, high = found["reflex_delay"].interval
+    assert low < 0.04 < high
 
 
 def test_without_it_the_muscle_is_wrong_and_the_verdict_says_so():
@@ -150,9 +168,8 @@ def test_the_shares_of_tissues_and_reflex_and_that_of_the_other_half(x64):
         windows.extend(one.window for one in some)
         task = muscle(0.0).replace(c_w=4000.0, c_z=300.0)
         options = FitOptions(free=("k_w", "k_z", "c_w", "c_z", "m_z"))
-        return planned_with_reflex(
-            task, jm.Target("half", None, stiffness=target.stiffness), options
-        )
+        task, options = with_reflex(task, options)
+        return planned(task, jm.Target("half", None, stiffness=target.stiffness), options)
 
     found = explained(muscle(20.0), (given,), (0.5, 25.0), planned_for, 60)
     assert windows == [(4.0, 34.0), (34.0, 64.0)]

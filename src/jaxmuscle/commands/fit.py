@@ -295,8 +295,9 @@ def fit(
                 "--segments and --dataset belong to spectra, and these are recordings: leave"
                 " them out"
             )
+        options |= {"reflex": str(reflex)} if reflex is not None else {}
         if hold:
-            _check_hold(method, options["fix"], task, quantity, reflex)
+            _check_hold(method, options["fix"], task, quantity)
             most = 0 if rung is not None or noise is not None or options["free"] else RUNGS
             options |= {
                 "rungs": most if rungs is None else rungs,
@@ -319,7 +320,6 @@ def fit(
                 "seeds": seeds,
                 "rungs": rungs if rung is None else 0,
             }
-            options |= {"reflex": str(reflex)} if reflex is not None else {}
             options |= {"check_seeds": 0} if quick else {}
             seen, model = (
                 _aim_at_recordings(
@@ -387,11 +387,8 @@ def _check_hold(
     fixed: dict[str, float],
     task: str | None,
     quantity: str | None,
-    reflex: str | None,
 ) -> None:
     """Raise a `ValueError` for an option that does not go with --hold."""
-    if reflex is not None:
-        raise ValueError("--reflex: with --hold none is looked for yet; leave it out")
     if method != MethodName.linear:
         raise ValueError(
             "with --hold all records are fitted by the formula of the spectrum: leave out --method"

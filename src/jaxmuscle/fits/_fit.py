@@ -24,7 +24,7 @@ from jaxmuscle.objective._options import FitOptions, JointFitOptions, OneFitOpti
 from ._joint import fit_jointly
 from ._model_choice import Models, first_rung, options_for
 from ._perturbed import ANEW, alike, analysed, explained, recordings_of, seen_with, without_rhythm
-from ._reflex import planned_with_reflex
+from ._reflex import check_reflex, may_have_reflex, with_reflex
 from ._result import FitResult
 from ._search import search
 
@@ -136,6 +136,7 @@ def fit(
       a free P_w. Where one target is of a moved insertion, the masses are not scaled, and are free
       in all tasks
     - `rungs`: 0; all targets get the same model. Not with tasks
+    - `reflex`: it is one and the same in all tasks of a moved insertion
     - no `method`, no `dt`
 
     **Returns:** a `FitResult`, with a part for each target; a fit that fails is one, too, and says
@@ -198,7 +199,7 @@ def _explained(
     def planned_for(target: Target, some: Sequence[PerturbedRecording]) -> Plan:
         models = _models(task, target, given, number, tuple(some))
         if fitted.reflex is not None and models.with_reflex is not None:
-            return models.with_reflex(number, None)
+            return models.with_reflex(number, ())
         return models.plan_at(number)
 
     known = response.known
@@ -234,26 +235,21 @@ def _models(
         again = seen_with(muscles[0], recordings)
         return None if alike(target, again) else _models(task, again, given, top, recordings)
 
-    def with_reflex(number: int, seen_by: AbstractTask | None) -> Plan:
+    def reflexive(number: int, seen_by: tuple[AbstractTask, ...]) -> Plan:
         own = quiet if number == QUIET else on_rung(base, number) if number else base
-        aim = target if seen_by is None or not recordings else seen_with(seen_by, recordings)
-        return planned_with_reflex(own, aim.with_measures(), options_for(own, options))
+        aim = seen_with(seen_by[0], recordings) if recordings and seen_by else target
+        moved, how = with_reflex(own, options_for(own, options))
+        return planned(moved, aim.with_measures(), how)
 
     first = first_rung([target], lowest, top) if top > lowest else lowest
-    possible = target.stiffness is not None and not unknown and options.method == "linear"
-    possible = possible and type(base) is PrescribedLength and base.reflex is None
-    require(
-        possible or options.reflex != "linear",
-        "reflex = 'linear': a reflex is fitted to a recording of a moved limb or to its response,"
-        " with a PrescribedLength without one, by the formula. Leave it out",
-    )
+    sought = check_reflex(options, possible=may_have_reflex(base, target, options))
     return Models(
         first,
         lowest,
         top,
         plan_at,
         renewed if recordings else None,
-        with_reflex if possible and options.reflex != "none" else None,
+        reflexive if sought else None,
         options.reflex,
     )
 

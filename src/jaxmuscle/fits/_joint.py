@@ -32,6 +32,7 @@ from jaxmuscle.response._scaling import is_scalable, times_force
 
 from ._model_choice import Models, first_rung
 from ._perturbed import ANEW, aimed, alike, recordings_of, seen_with
+from ._reflex import check_reflex, may_have_reflex, with_reflex
 from ._result import FitResult
 from ._search import search
 
@@ -55,12 +56,7 @@ def fit_jointly(
     asked = FitOptions(**usual | options)
     rungs = asked.rungs or 0
     loaded = _loaded(targets, tasks or {})
-    for argument, named in (("task", tasks or {}), ("mean_force", mean_force or {})):
-        for name in named:
-            if name not in loaded:
-                raise ValueError(
-                    f"{argument}: no target is called {name!r}: {choices(name, loaded)}"
-                )
+    _check_named(loaded, {"task": tasks or {}, "mean_force": mean_force or {}})
     if rungs and (tasks or rungs >= len(RUNGS)):
         raise ValueError(
             f"rungs = {rungs}: give at most {len(RUNGS) - 1}, and no tasks: they are their own"
@@ -71,6 +67,10 @@ def fit_jointly(
         for name, given in targets.items()
         if (found := recordings_of(given, (tasks or {}).get(name)))
     }
+
+    def as_seen(muscles: Tasks) -> dict[str, Target]:
+        """The targets of the moved records, with the answer of these tasks taken off."""
+        return {name: seen_with(muscles[name], moved[name]).with_measures() for name in moved}
 
     def all_models(loaded: dict[str, Target], options: FitOptions) -> Models:
         """The base model, and the richer ones."""
@@ -83,26 +83,48 @@ def fit_jointly(
             base, means, factor = _at_means(base, loaded)
             carried, options = tuple(means), dataclasses.replace(options, carried=factor)
 
+        def on(rung: int) -> Tasks:
+            return {name: on_rung(task, rung) for name, task in base.items()} if rung else base
+
         def plan_at(rung: int) -> Plan:
-            made = {name: on_rung(task, rung) for name, task in base.items()} if rung else base
+            made = on(rung)
             return planned_jointly(made, loaded, options, separate, proportional, means, carried)
 
         def renewed(muscles: tuple[AbstractTask, ...]) -> Models | None:
             options.progress(ANEW, 0.0)
             fitted = dict(zip(loaded, muscles, strict=True))
-            again = loaded | {name: seen_with(fitted[name], found) for name, found in moved.items()}
+            again = loaded | as_seen(fitted)
             return (
                 None
                 if all(alike(loaded[name], again[name]) for name in moved)
                 else all_models(again, options)
             )
 
+        def reflexive(rung: int, seen_by: tuple[AbstractTask, ...]) -> Plan:
+            how, made = options, on(rung)
+            for name in answering:
+                task, how = with_reflex(made[name], options)
+                made = made | {name: task}
+            aims = loaded | (as_seen(dict(zip(loaded, seen_by, strict=True))) if seen_by else {})
+            return planned_jointly(made, aims, how, separate, proportional, means, carried)
+
+        answering = [n for n, task in base.items() if may_have_reflex(task, loaded[n], options)]
+        sought = check_reflex(options, possible=bool(answering))
         first = first_rung(list(loaded.values()), 0, rungs)
-        return Models(first, 0, rungs, plan_at, renewed if moved else None)
+        return Models(
+            first,
+            0,
+            rungs,
+            plan_at,
+            renewed if moved else None,
+            reflexive if sought else None,
+            options.reflex,
+        )
 
     with told(progress, f"fitting {', '.join(loaded)}") as tell, fitting():
         models = all_models(loaded, dataclasses.replace(asked, progress=tell))
-        result = search(models.plan_at(models.first), answer, models if rungs else None)
+        several = rungs > 0 or models.with_reflex is not None
+        result = search(models.plan_at(models.first), answer, models if several else None)
     left_out = () if mean_force is not None or not tasks else _far_from_means(result)
     return dataclasses.replace(result, notices=(*result.notices, *left_out))
 
@@ -152,6 +174,7 @@ def planned_jointly(
         None if options.free is None else tuple(options.free),
         options.fix or (),
         tuple(carried),
+        options.also_free,
     )
     names, moved = joint_names(local, tasks, separate), _any_moved(targets)
     known = list(dict.fromkeys(joint for of in names.values() for joint in of.values()))
@@ -164,6 +187,7 @@ def planned_jointly(
             dataclasses.replace(
                 options,
                 free=local[name],
+                also_free=(),
                 fix=None,
                 bounds=_own(bounds, names[name]),
                 priors=_own(priors, names[name] | {DAMPING: DAMPING}),
@@ -200,6 +224,15 @@ def _loaded(targets: Mapping[str, Any], tasks: Mapping[str, AbstractTask]) -> di
         if not name or "@" in name:
             raise ValueError(f"target: a name must not be empty nor contain '@', as {name!r} does")
     return {name: aimed(t, tasks.get(name)).with_measures() for name, t in targets.items()}
+
+
+def _check_named(loaded: Mapping[str, Target], given: Mapping[str, Mapping[str, Any]]) -> None:
+    for argument, named in given.items():
+        for name in named:
+            if name not in loaded:
+                raise ValueError(
+                    f"{argument}: no target is called {name!r}: {choices(name, loaded)}"
+                )
 
 
 def _any_moved(targets: Mapping[str, Target]) -> bool:
@@ -251,6 +284,7 @@ def _local_free(
     free: Iterable[str] | None,
     fix: Iterable[str],
     carried: Iterable[str],
+    also: Iterable[str],
 ) -> dict[str, tuple[str, ...]]:
     """The free parameters of every target's task."""
     found, moved = {}, _any_moved(targets)
@@ -268,6 +302,7 @@ def _local_free(
         held = {base_of(n): 0.0 for n, holders in fixed.items() if t in holders}
         found[t] = free_names(task, None if free is None else here, held, targets[t], moved=moved)
         found[t] += ("P_w",) if t in carried and "P_w" not in found[t] else ()
+        found[t] += tuple(n for n in also if n in task.parameter_names and n not in found[t])
     return found
 
 

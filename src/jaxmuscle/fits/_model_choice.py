@@ -270,9 +270,9 @@ class Models(NamedTuple):
     """The models that may be tried: the first, from which rung up to which, and how each is fitted.
 
     `renewed`: of moved records, what the muscles that were fitted make of their targets; None where
-    that says nothing new. `with_reflex`: the plan of a rung with a reflex, its target that which a
-    task makes of the records (None: as it was); `reflex`, whether one is looked for ("auto"), left
-    out ("none") or fitted in any case ("linear").
+    that says nothing new. `with_reflex`: the plan of a rung with a reflex, its targets those which
+    tasks make of the records (none: as they were); `reflex`, whether one is looked for ("auto"),
+    left out ("none") or fitted in any case ("linear").
     """
 
     first: int
@@ -280,7 +280,7 @@ class Models(NamedTuple):
     top: int
     plan_at: Callable[[int], Plan]
     renewed: "Callable[[tuple[AbstractTask, ...]], Models | None] | None" = None
-    with_reflex: Callable[[int, AbstractTask | None], Plan] | None = None
+    with_reflex: Callable[[int, tuple[AbstractTask, ...]], Plan] | None = None
     reflex: str = "none"
 
 

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle._common.arrays import require
 from jaxmuscle._common.text import probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import REFLEX
 from jaxmuscle.model._reflex import Reflex
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
-from jaxmuscle.objective._arguments import Plan, planned
 from jaxmuscle.objective._options import FitOptions
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._starts import OTHER_MODEL, SPREAD, starting_points
@@ -132,13 +132,31 @@ def _shifts(ended: Endpoint, i: int, column: np.ndarray) -> dict[str, tuple[floa
     return found
 
 
-def planned_with_reflex(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
-    """The fit of a task with a reflex: its gain may be anything above 0, and its delay anything
-    between 20 and 130 ms."""
+def may_have_reflex(task: AbstractTask, target: Target, options: FitOptions) -> bool:
+    """Whether a reflex can be looked for beside this task: the paper's muscle, moved, with a
+    response among data that are judged."""
+    judged = not len(target.bins) or target.segments is not None or target.sigma is not None
+    moved = type(task) is PrescribedLength and task.reflex is None and target.stiffness is not None
+    return moved and judged and options.method == "linear"
+
+
+def check_reflex(options: FitOptions, *, possible: bool) -> bool:
+    """Whether one is looked for. Raises `ValueError` where it is asked for and cannot be."""
+    require(
+        possible or options.reflex != "linear",
+        "reflex = 'linear': a reflex is fitted to a recording of a moved limb or to its response,"
+        " with a PrescribedLength without one, by the formula. Leave it out",
+    )
+    return possible and options.reflex != "none"
+
+
+def with_reflex(task: AbstractTask, options: FitOptions) -> tuple[AbstractTask, FitOptions]:
+    """The task with a reflex, and how it is fitted: its gain may be anything above 0, and its delay
+    anything between 20 and 130 ms."""
     priors = {"reflex_gain": None, "reflex_delay": None, **(options.priors or {})}
     free = (*options.also_free, *REFLEX)
     options = dataclasses.replace(options, also_free=free, priors=priors)
-    return planned(task.with_parts(reflex=Reflex()), target, options)
+    return task.with_parts(reflex=Reflex()), options
 
 
 def starts_with_reflex(

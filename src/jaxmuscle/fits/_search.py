@@ -143,7 +143,7 @@ class _Search:
         test = self.reflex = look_for_reflex(without.ended)
         if test is None or not (test.seen or models.reflex == "linear"):
             return
-        found = self._with_reflex(models.with_reflex(without.rung.number, None), without, test)
+        found = self._with_reflex(models.with_reflex(without.rung.number, ()), without, test)
         if found is None:
             return
         # the AIC of two models of one target; that of the second turn is another one
@@ -155,9 +155,10 @@ class _Search:
         self.keep(found)
         # what is taken off the recordings beside the linear answer is that of the reflex found
         for _ in range(RENEWALS if models.renewed is not None else 0):
-            seen_by = _reached(self.plan, self.stages)[0]
+            seen_by = _reached(self.plan, self.stages)
             again = models.with_reflex(without.rung.number, seen_by)
-            if alike(*(plan.problem.parts[0].target for plan in (self.plan, again))):
+            parts = zip(self.plan.problem.parts, again.problem.parts, strict=True)
+            if all(alike(one.target, other.target) for one, other in parts):
                 return
             found = self._with_reflex(again, found, test)
             if found is None:

@@ -119,6 +119,7 @@ class JointFitOptions(SimulationOptions, total=False):
     separate: Iterable[str]
     proportional: Iterable[str]
     mean_force: Mapping[str, tuple[float, float]] | None
+    reflex: str
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
