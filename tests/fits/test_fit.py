@@ -795,7 +795,7 @@ def test_a_model_that_explodes_everywhere_is_a_result(x64, method, reason):
     assert not result.success and reason in result.message
     assert result.chi2_per_bin is None and np.all(np.isnan(result.fitted))
     assert result.parameters["c_w"].stderr is None and not result.parameters["c_w"].identifiable
-    assert any(line.startswith("Not fitted: ") for line in str(result).splitlines())
+    assert any(line.startswith("MODEL  not fitted: ") for line in str(result).splitlines())
 
 
 def literal():

@@ -114,7 +114,7 @@ def test_metadata_of_the_wheel(built):
     assert data["Description-Content-Type"] == "text/markdown"
     # a page of an index has nothing beside it to which a relative link could lead
     text = data.get_payload()
-    assert "make fit" in text and "](https://" in text
+    assert "make fit" in text
     assert not re.findall(r"\]\((?!https?://)[^)]*\)", text)
     pythons = {f"Programming Language :: Python :: 3.{minor}" for minor in (11, 12, 13)}
     assert pythons <= set(data.get_all("Classifier", []))

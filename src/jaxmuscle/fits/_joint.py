@@ -7,6 +7,7 @@ from typing import Any
 from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
+from jaxmuscle.data._frequency_response import FrequencyResponse
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import proper, unknown_parameter
@@ -20,10 +21,12 @@ from jaxmuscle.objective._arguments import (
     check_shared,
     free_names,
     joint_names,
+    on_joint,
     planned,
     settings_of,
     target_of,
     with_masses,
+    with_open_mass,
 )
 from jaxmuscle.objective._derived import MEAN
 from jaxmuscle.objective._options import FitOptions
@@ -79,6 +82,7 @@ def fit_jointly(
             mean_force,
             (),
         )
+        options = with_open_mass(options, joint=bool(_joint_of(loaded)))
         if means is None and not tasks and "P_w" not in map(base_of, asked.fix or ()):
             base, means, factor = _at_means(base, loaded)
             carried, options = tuple(means), dataclasses.replace(options, carried=factor)
@@ -235,6 +239,12 @@ def _check_named(loaded: Mapping[str, Target], given: Mapping[str, Mapping[str, 
                 )
 
 
+def _joint_of(targets: Mapping[str, Target]) -> list[tuple[FrequencyResponse, float]]:
+    """Responses that are of a joint, each with its lever arm."""
+    answers = [t.stiffness for t in targets.values() if t.stiffness is not None]
+    return [(one, one.lever_arm) for one in answers if one.lever_arm is not None]
+
+
 def _any_moved(targets: Mapping[str, Target]) -> bool:
     """Whether the insertion was moved for one of the targets."""
     return any(target.stiffness is not None for target in targets.values())
@@ -310,7 +320,7 @@ def _at_means(
     tasks: Tasks, targets: dict[str, Target]
 ) -> tuple[Tasks, dict[str, tuple[float, float]], float | None]:
     """All tasks scaled by one number to the first mean force that a target states, each P_w to its
-    own; means, number."""
+    own, and carried to the response of a joint; means, number."""
     stated = {
         name: t.mean_force
         for name, t in targets.items()
@@ -323,6 +333,8 @@ def _at_means(
     scaled = {name: times_force(task, factor) for name, task in tasks.items()}
     if _any_moved(targets):
         scaled = {name: with_masses(task, tasks[name], factor) for name, task in scaled.items()}
+    for answer, arm in _joint_of(targets)[:1]:
+        scaled = {n: on_joint(tasks[n], task, answer, arm) for n, task in scaled.items()}
     own = {
         name: scaled[name].replace(P_w=float(scaled[name]["P_w"]) * value / mean)
         for name, (value, _) in stated.items()

@@ -253,6 +253,12 @@ class Climbed(NamedTuple):
     ended: Endpoint
     rung: Rung
 
+    @property
+    def least_cost(self) -> float:
+        """Half of chi² and prior where it ended."""
+        minima = self.stages[-1].minima
+        return float(minima.cost[minima.best])
+
 
 def options_for(task: AbstractTask, options: FitOptions) -> FitOptions:
     """How one of the models is fitted: a harmonic that it does not have is not fixed."""

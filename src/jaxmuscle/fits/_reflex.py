@@ -68,7 +68,7 @@ class ReflexTest(NamedTuple):
         return (
             f"muscle and stretch reflex cannot be told apart in these data. {none[0].upper()}"
             f"{none[1:]}; but one that is just too weak to be seen ({self.least:.2g} N s/m) would"
-            f" change {words}, more than the stated errors. {WIDER}"
+            f" change {words}, more than the errors, which hold if there is none. {WIDER}"
         )
 
 

@@ -18,6 +18,7 @@ from jaxmuscle._common.executors import AnyExecutor, results_of
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle._common.progress import nothing
 from jaxmuscle.ensembles._ensemble import runs_for_means
+from jaxmuscle.model._parameters import REFLEX as ADDED
 from jaxmuscle.model._rungs import REFLEX
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan
@@ -48,7 +49,8 @@ STILL = 2e-3
 # Data that are fitted together. How many must not depend on who works: the last bits of a fit may
 # hang on its neighbours. With 32 starts each they fill the programs' rows; more gain nothing.
 TOGETHER = 4
-REFLEX_MARGIN = 4.0  # of AIC, by which a model with a reflex that is seen must be better
+# by which chi² and prior fall where a reflex that is seen is kept, beside 2 for each parameter
+REFLEX_MARGIN = 4.0
 RENEWALS = 2  # of the target of a moved record, where a richer model than the base one was chosen
 TOLD = {
     "trying starts": "searching from all starting points",
@@ -146,8 +148,9 @@ class _Search:
         found = self._with_reflex(models.with_reflex(without.rung.number, ()), without, test)
         if found is None:
             return
-        # the AIC of two models of one target; that of the second turn is another one
-        if models.reflex == "auto" and found.rung.aic > without.rung.aic - REFLEX_MARGIN:
+        # of one target, with the same errors; that of the second turn is another one
+        fell = 2 * (without.least_cost - found.least_cost)
+        if models.reflex == "auto" and fell < 2 * len(ADDED) + REFLEX_MARGIN:
             self.reflex = test._replace(fitted=False)
             return
         others = [msgspec.structs.replace(rung, chosen=False) for rung in self.ladder]

@@ -39,6 +39,7 @@ COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
 # doi:10.1115/1.3426220): nothing in it swings.
 DAMPING = "damping_ratio"
 DAMPING_SD = 0.5
+ACTIVE_SD = 1.0  # of the log of a joint's active mass
 # Hz, in which a fit holds resonances that begin there: the one that is called tremor, of force and
 # of what moves, and the slower one
 TREMOR = {"force": (6.0, 14.0)}
@@ -141,17 +142,27 @@ def at_mean(
     if response is not None and varies:
         # a force that varies by more than its mean: that is no scale, and no datum
         stated, arm = None, arm or LEVER_ARM
+    options = with_open_mass(options, joint=arm is not None)
     if stated is None or level is None or level in (options.fix or {}):
-        return task if arm is None else _on_joint(task, task, response, arm), options
+        return task if arm is None else on_joint(task, task, response, arm), options
     free = (*options.also_free, level)
     moved = task.at_force(stated[0])
     factor = float(moved["m_w"]) / float(task["m_w"])
     if target.stiffness is not None:
         moved = with_masses(moved, task, factor)
         if arm is not None:
-            moved = _on_joint(task, moved, response, arm)
+            moved = on_joint(task, moved, response, arm)
             return moved, dataclasses.replace(options, mean_force=stated, also_free=free)
     return moved, dataclasses.replace(options, mean_force=stated, also_free=free, carried=factor)
+
+
+def with_open_mass(options: FitOptions, *, joint: bool) -> FitOptions:
+    """With the prior of a joint's active mass, where that is free: of what moves about the axis
+    nobody knows which share lies between the tissues."""
+    free = options.free is None or "m_w" in options.free
+    if not joint or not free or "m_w" in (options.fix or {}):
+        return options
+    return dataclasses.replace(options, priors={"m_w": ACTIVE_SD, **(options.priors or {})})
 
 
 def with_masses(carried: AbstractTask, task: AbstractTask, factor: float) -> AbstractTask:
@@ -165,7 +176,7 @@ def with_masses(carried: AbstractTask, task: AbstractTask, factor: float) -> Abs
     return carried.replace(**kept, **damping)
 
 
-def _on_joint(
+def on_joint(
     task: AbstractTask, moved: AbstractTask, stiffness: FrequencyResponse | None, arm: float
 ) -> AbstractTask:
     """The task as it is at the lever arm r of a joint, with spring K, damper and mass I of its

@@ -277,12 +277,18 @@ def shade_deviations(ax: Axes) -> None:
         ax.axhspan(-deviations, deviations, color=shade(grey), lw=0, zorder=0)
 
 
+ROOMY = 3.0  # inches, in which three decades have room for three numbers each
+
+
 def log_axis(ax: Axes, which: Literal["x", "y"] = "x") -> None:
     """A logarithmic abscissa or ordinate with plain numbers, as many as have room, and two at
     least."""
     ax.set(**{f"{which}scale": "log"})
+    room = ax.get_window_extent().width / ax.figure.dpi  # inches
     (low, high), axis, decades = (
-        (ax.get_xlim(), ax.xaxis, 1e3) if which == "x" else (ax.get_ylim(), ax.yaxis, 1e2)
+        (ax.get_xlim(), ax.xaxis, 1e3 if room > ROOMY else 1e2)
+        if which == "x"
+        else (ax.get_ylim(), ax.yaxis, 1e2)
     )
     narrow = high < NARROW * low
     axis.set_major_locator(
