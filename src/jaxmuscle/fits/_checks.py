@@ -48,7 +48,7 @@ BEGAN = {
     OWN: "from the task's own values",
 }
 MISSED = 3.0  # standard deviations of a measured mean or variation
-PULLED = 3.0  # prior standard deviations
+PULLED = 2.0  # prior standard deviations
 # standard errors of a response that is seen clearly; of the tangent stiffness
 CLEAR, EXTRAPOLATED = 4.0, 2.0
 NONLINEAR = 0.1
@@ -323,9 +323,9 @@ def mass_notices(coordinates: Coordinates, theta: Float[np.ndarray, " free"]) ->
                 f"{name} went to {centre * np.exp(at * sd):.2g} kg, {abs(at):.2g} standard"
                 f" deviations of its prior from the {centre:.2g} kg with which the fit began. No"
                 " record determines it, so something else pulls it: the force may fluctuate in a"
-                " way that this muscle cannot, or another mass moves. Then stiffness and damping"
-                " may be wrong by more than their errors. Compare them with K and B of jaxmuscle"
-                " analyse, which look at the response alone"
+                " way that this muscle cannot, another mass moves, a weak reflex answers, or the"
+                " limb is no two tissues in series. So the numbers of the tissues, H(0) and B0 are"
+                " not stated. Take K and B of jaxmuscle analyse, which look at the response alone"
             )
     return tuple(said)
 

@@ -125,7 +125,10 @@ def explained(
         found["reflex"] = found["together"] - found["tissues"]
     each, sums = halves(recordings), np.zeros(2)
     for one, other in zip(each, each[::-1], strict=True):
-        plan = planned_for(seen_with(task, one), one)
+        try:
+            plan = planned_for(seen_with(task, one), one)
+        except ValueError:  # a half in which too little moves has no fit of its own
+            return found
         c = plan.problem.coordinates
         point = c.from_theta(c.at(np.array([[float(task[name]) for name in c.names]])))
         fitted = least_squares(plan.problem.linear(), np.asarray(point), max_steps)

@@ -69,6 +69,7 @@ from ._stages import Stage, controlled_moments
 from ._verdict import Endpoint, elsewhere
 
 OUTPUTS = (VARIATION, MEAN)
+OF_TISSUES = {*SPLIT, "tangent_stiffness", "B0"}  # not stated where there are no such tissues
 BASE = {"K_w0": "k_w", "K_z0": "k_z", "C_w0": "c_w", "C_z0": "c_z"}
 STRAIGHT = 0.25  # error of a log up to which a quantity is as good as linear
 VAGUE = 100.0  # from the lower to the upper end of an interval
@@ -440,8 +441,14 @@ def report_fit(
         moved |= {n for n in parameters | derived if base_of(n).startswith("harmonic_")}
         other += (may_be_elsewhere(share),)
     unseen, why = find_unseen(problem, parameters | derived)
-    curved = too_curved(problem, derived, known)
-    moved |= {n for n in curved if not is_stated(problem, n)} | unseen
+    heavy, curved = mass_notices(problem.coordinates, theta), too_curved(problem, derived, known)
+    moved |= {
+        n
+        for n in parameters | derived
+        if n in unseen
+        or (n in curved and not is_stated(problem, n))
+        or (heavy and base_of(n) in OF_TISSUES)
+    }
     parameters, derived = (
         widened(without_errors(moved, table), ended.widening) for table in (parameters, derived)
     )
@@ -479,7 +486,7 @@ def report_fit(
         notices=(
             *unchecked,
             *ended.judged[1],
-            *mass_notices(problem.coordinates, theta),
+            *heavy,
             *reach_notices(derived, parts),
             *prior_notices(resting),
             *(narrow_notices(derived, parts) if describes else ()),

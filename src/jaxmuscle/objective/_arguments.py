@@ -39,7 +39,8 @@ COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
 # doi:10.1115/1.3426220): nothing in it swings.
 DAMPING = "damping_ratio"
 DAMPING_SD = 0.5
-ACTIVE_SD = 1.0  # of the log of a joint's active mass
+# of a joint's active mass: times the share that it has in the task, sd of its log
+ACTIVE, ACTIVE_SD = 0.5, 0.7
 # Hz, in which a fit holds resonances that begin there: the one that is called tremor, of force and
 # of what moves, and the slower one
 TREMOR = {"force": (6.0, 14.0)}
@@ -158,7 +159,8 @@ def at_mean(
 
 def with_open_mass(options: FitOptions, *, joint: bool) -> FitOptions:
     """With the prior of a joint's active mass, where that is free: of what moves about the axis
-    nobody knows which share lies between the tissues."""
+    nobody knows which share lies between the tissues. It is that of the muscle, so rather less than
+    that of the bones."""
     free = options.free is None or "m_w" in options.free
     if not joint or not free or "m_w" in (options.fix or {}):
         return options
@@ -182,10 +184,11 @@ def on_joint(
     """The task as it is at the lever arm r of a joint, with spring K, damper and mass I of its
     response.
 
-        x_ref, v_ref ∝ r,   m = m₀ I / I₀,   K_0 = K_00 K / K₀,   C_0 = C_00 √(K I / (K₀ I₀))
+        x_ref, v_ref ∝ r,   m_z = m_z0 I / I₀,   m_w = m_w0 I / 2I₀
+        K_0 = K_00 K / K₀,   C_0 = C_00 √(K I / (K₀ I₀))
 
     I₀ and K₀ are those of `task` (m_z; both stiffnesses in series), at the lever arm `LEVER_ARM`.
-    Both damping ratios stay, and P_w is that of `moved`, or in proportion if that is `task`. All of
+    P_w is that of `moved`, or in proportion if that is `task`. All of
     it is about the axis what it is at any other r.
     """
     assert stiffness is not None
@@ -195,7 +198,8 @@ def on_joint(
     longer = arm / LEVER_ARM
     damped = math.sqrt(stiffer * heavier)
     factors = {
-        **dict.fromkeys(MASSES, heavier),
+        "m_w": ACTIVE * heavier,
+        "m_z": heavier,
         **dict.fromkeys(("x_ref_w", "x_ref_z", "v_ref_w", "v_ref_z"), longer),
         **dict.fromkeys(("k_w", "k_z"), stiffer / longer**2),
         **dict.fromkeys(("c_w", "c_z"), damped / longer**2),
