@@ -83,7 +83,7 @@ def spread(name: str, values: list[float], stated: list[float], true: float) -> 
         f" scatter {sd:7.2g}",
         end="",
     )
-    print(f"  stated {np.mean(errors):7.2g}  within 1.96 errors {inside:3.0f} %", flush=True)
+    print(f"  stated {np.nanmean(errors):7.2g}  within 1.96 errors {inside:3.0f} %", flush=True)
 
 
 def classical(count: int) -> None:
@@ -638,7 +638,7 @@ def cascade(count: int) -> None:
         fits = [jm.fit(TASK, record, seeds=0, check_seeds=0) for record in records]
         limb = [fit["tangent_stiffness"] for fit in fits]
         scale = fits[0].target.stiffness.lever_arm ** 2
-        errors = [scale * p.stderr for p in limb if p.stderr is not None]
+        errors = [scale * (np.nan if p.stderr is None else p.stderr) for p in limb]
         found = [scale * p.value for p in limb]
         spread("  fit, stiffness", found, errors, ANKLE["K_w"] * through)
         # one of twice the gain that answers lengthening alone is the linear one and what is beside

@@ -90,6 +90,23 @@ def test_it_is_fitted_where_that_is_asked_for():
     assert gain.stderr is None or gain.value < 4 * gain.stderr
 
 
+def test_of_a_limb_that_is_one_spring_no_tissues_are_stated():
+    """The mass between them runs off, which makes one spring of two. Gain and phase are right."""
+    s = 2j * np.pi * F
+    spring = (133.0 + 2.0 * s + 0.02 * s**2) / ARM**2
+    noise = np.random.default_rng(3).normal(size=(2, F.size))
+    sd = 0.005 * np.abs(spring)
+    seen = jm.data.FrequencyResponse(F, spring + sd * (noise[0] + 1j * noise[1]), sd)
+    found = jm.fit(jm.PrescribedLength(m_w=4.0, m_z=8.0), seen, starts=32)
+    assert "reflex_gain" not in found.parameters
+    assert any(notice.startswith("m_w went to ") for notice in found.notices)
+    for name in ("K_w_tangent", "K_z0", "k_w", "tangent_stiffness", "B0"):
+        assert found[name].stderr is None and found[name].interval is None, name
+    for f, gain in zip(found.only.thirds, ("gain_low", "gain_middle", "gain_high"), strict=True):
+        H = abs(np.interp(f, F, spring))
+        assert abs(found[gain].value - H) < 3.5 * found[gain].stderr < 0.02 * H
+
+
 def test_what_cannot_be_told_is_said():
     nothing = np.zeros(len(DELAYS))
     shifts = {"K_z0": (0.4, 2.5), "K_w_tangent": (0.01, 0.2)}

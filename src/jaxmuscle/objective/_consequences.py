@@ -304,7 +304,8 @@ def _expanded(
 
     def spread(x: np.ndarray) -> np.ndarray:
         whole = np.zeros((*np.shape(x)[:-1], len(names)))
-        whole[..., moving] = x * stretch.reshape(len(values), *[1] * (np.ndim(x) - 2), -1)
+        with np.errstate(invalid="ignore"):  # of rows where a search runs off
+            whole[..., moving] = x * stretch.reshape(len(values), *[1] * (np.ndim(x) - 2), -1)
         return whole
 
     return moments, jax.tree.map(spread, slopes)

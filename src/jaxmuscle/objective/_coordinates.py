@@ -126,13 +126,11 @@ class Coordinates(eqx.Module):
         return dict(zip(self.names, natural, strict=True))
 
     def values_of(self, theta: Float[np.ndarray, "rows free"]) -> Float[np.ndarray, "rows free"]:
-        """Natural values of many θ, in the order of `names`."""
+        """Natural values of many θ, in the order of `names`; infinite where a search runs off."""
         step = self.sd * theta
-        return np.where(
-            self.positive,
-            self.centre * np.exp(np.where(self.positive, step, 0.0)),
-            self.centre + step,
-        )
+        with np.errstate(over="ignore"):
+            scaled = self.centre * np.exp(np.where(self.positive, step, 0.0))
+        return np.where(self.positive, scaled, self.centre + step)
 
     def at(self, values: Numbers) -> Numbers:
         """θ of the parameters' natural values, in the order of `names`: the reverse of `values`."""
