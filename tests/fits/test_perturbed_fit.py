@@ -726,6 +726,8 @@ def test_the_prior_of_a_joint_is_carried_by_the_lever_arm():
             assert arm**2 * k_w * k_z / (k_w + k_z) == pytest.approx(45.0, rel=1e-3)
             assert arm**2 * float(task["m_z"]) == pytest.approx(0.015, rel=1e-3)
             assert float(task["x_ref_w"]) == pytest.approx(0.02 * arm / 0.05)
-            ratio = [float(t["C_w0"]) ** 2 / float(t["K_w0"] * t["m_w"]) for t in (task, base)]
+            # of what turns, a half of the task's share is between the tissues
+            assert arm**2 * float(task["m_w"]) == pytest.approx(0.5 * 0.015, rel=1e-3)
+            ratio = [float(t["C_w0"]) ** 2 / float(t["K_w0"] * t["m_z"]) for t in (task, base)]
             assert ratio[0] == pytest.approx(ratio[1])
             assert (options.mean_force is None) == (varies is None)

@@ -41,8 +41,10 @@ def test_a_notebook_can_be_read_without_running_it(path):
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     # A story that is read at one sitting; the formatter decides on lines, so that statements count.
+    # The eighth has a story for each of two people.
+    stories = 1 + (path.stem == "08-perturb-and-measure")
     written = [ast.walk(ast.parse(cell.source)) for cell in code]
-    assert sum(isinstance(node, ast.stmt) for nodes in written for node in nodes) <= 52
+    assert sum(isinstance(node, ast.stmt) for nodes in written for node in nodes) <= 52 * stories
     # run once, from top to bottom
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
     assert not [
