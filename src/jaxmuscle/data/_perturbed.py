@@ -71,9 +71,9 @@ LINEAR = (
 # standard errors and such a difference from 1 on; of a reflex, so many standard errors from 0.
 FROM_ALL, FROM_NONE, SURELY, DIFFERENT = 2.5, 2.0, 4.0, 0.2
 ONE_WAY = (
-    "the reflex answers lengthening more than shortening: {:.0f} ± {:.0f} % of what one to"
-    " lengthening alone does beside its linear part ({:.2g} N rms) is in the force. That is taken"
-    " off, too"
+    "the reflex answers lengthening more than shortening: {:.0f} ± {:.0f} %, where 0 % is both"
+    " alike and 100 % is lengthening alone. Its answer was taken off the force accordingly (at 100"
+    " % {:.2g} N rms more than that of a linear reflex)"
 )
 UNLIKE = (
     "the force answers the movement {} nonlinearly than the muscle of the model. The nonlinear part"

@@ -18,7 +18,6 @@ from jaxmuscle._common.executors import AnyExecutor, results_of
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle._common.progress import nothing
 from jaxmuscle.ensembles._ensemble import runs_for_means
-from jaxmuscle.model._parameters import REFLEX as ADDED
 from jaxmuscle.model._rungs import REFLEX
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan
@@ -49,8 +48,8 @@ STILL = 2e-3
 # Data that are fitted together. How many must not depend on who works: the last bits of a fit may
 # hang on its neighbours. With 32 starts each they fill the programs' rows; more gain nothing.
 TOGETHER = 4
-# by which chi² and prior fall where a reflex that is seen is kept, beside 2 for each parameter
-REFLEX_MARGIN = 4.0
+# by which chi² and prior fall where a reflex that is seen is kept: 2 for each parameter, and 4
+REFLEX_MARGIN = 10.0
 RENEWALS = 2  # of the target of a moved record, where a richer model than the base one was chosen
 TOLD = {
     "trying starts": "searching from all starting points",
@@ -150,7 +149,7 @@ class _Search:
             return
         # of one target, with the same errors; that of the second turn is another one
         fell = 2 * (without.least_cost - found.least_cost)
-        if models.reflex == "auto" and fell < 2 * len(ADDED) + REFLEX_MARGIN:
+        if models.reflex == "auto" and fell < REFLEX_MARGIN:
             self.reflex = test._replace(fitted=False)
             return
         others = [msgspec.structs.replace(rung, chosen=False) for rung in self.ladder]

@@ -188,8 +188,8 @@ def on_joint(
         K_0 = K_00 K / K₀,   C_0 = C_00 √(K I / (K₀ I₀))
 
     I₀ and K₀ are those of `task` (m_z; both stiffnesses in series), at the lever arm `LEVER_ARM`.
-    P_w is that of `moved`, or in proportion if that is `task`. All of
-    it is about the axis what it is at any other r.
+    P_w is that of `moved`, or in proportion if that is `task`. All of it is about the axis what it
+    is at any other r.
     """
     assert stiffness is not None
     k, i = stiffness.spring_and_mass

@@ -231,10 +231,8 @@ def _measured_response(part: FittedPart) -> list[str]:
     lines = []
     for f in dict.fromkeys(part.thirds):
         i = int(np.argmin(np.abs(found.frequency - f)))
-        H, error = found.value[i], found.stderr[i]
-        gain = Estimate(arm**2 * float(np.abs(H)), unit, arm**2 * float(error))
-        turn = float(np.degrees(error / np.abs(H)))
-        phase = Estimate(float(np.degrees(np.angle(H))), "deg", turn)
+        gain = Estimate(float(found.gain[i]), "N/m", float(found.stderr[i])).times(arm**2, unit)
+        phase = Estimate(float(found.phase[i]), "deg", float(found.phase_stderr[i]))
         lines.append(f"  {f'H({f:.2g} Hz)':<{WIDE}}{_briefly(gain)}, {_briefly(phase)}")
     return lines
 
@@ -355,7 +353,7 @@ def _row(name: str, p: Estimate, words: Mapping[str, str], wide: int = WIDE) -> 
     base, at, target = name.partition("@")
     said = words.get(base, base) + f", {target}" * bool(at)
     interval = p.interval_in_words() if p.stderr is not None else ""
-    return f"  {said:<{wide}}{_briefly(p):<25} {interval}".rstrip()
+    return f"  {said + ' ':<{wide}}{_briefly(p):<25} {interval}".rstrip()
 
 
 def _briefly(p: Estimate) -> str:
